@@ -1,0 +1,158 @@
+"""Block terrain with gaps, one random terrain per world (paper, section IV, "Locomotion on challenging terrain")."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+import tyro
+from torch import Tensor
+
+from quadhrl.errors import InputError
+
+__all__ = ["BlockTerrain", "TerrainConfig"]
+
+
+@dataclass
+class TerrainConfig:
+    """Square blocks on a regular grid; each is present with probability `infill`, its top at a random height."""
+
+    infill: Annotated[float, tyro.conf.arg(prefix_name=False)] = 0.9
+    """Probability that a block is present, 0 to 1; a missing block is a gap."""
+    height_range: Annotated[float, tyro.conf.arg(prefix_name=False)] = 0.05
+    """Peak-to-peak range of the block tops, uniform around 0 [m]."""
+    block_size: float = 0.2
+    """Edge length of a block [m]."""
+    gap_depth: float = 2.0
+    """Depth of the ground in a gap below height 0 [m]."""
+    platform_length: float = 0.8
+    """Extent in x of the gap-free, level start platform around the origin [m]; 0 means none."""
+    platform_width: float = 0.4
+    """Extent in y of the start platform [m]."""
+
+    def validate(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        if not 0.0 <= self.infill <= 1.0:
+            raise InputError("--infill", self.infill, "give a probability between 0 and 1")
+        if not 0.0 <= self.height_range <= 0.5:
+            raise InputError("--height-range", self.height_range, "give a range between 0 and 0.5 m")
+        if not 0.05 <= self.block_size <= 2.0:
+            raise InputError("--terrain.block-size", self.block_size, "give an edge length between 0.05 and 2 m")
+        if not 0.5 <= self.gap_depth <= 10.0:
+            raise InputError("--terrain.gap-depth", self.gap_depth, "give a depth between 0.5 and 10 m")
+        for field in ("platform_length", "platform_width"):
+            if not 0.0 <= getattr(self, field) <= 5.0:
+                flag = f"--terrain.{field.replace('_', '-')}"
+                raise InputError(flag, getattr(self, field), "give an extent between 0 and 5 m")
+
+
+class BlockTerrain:
+    """One random, endless block terrain per world, a pure function of (seed, world, episode).
+
+    Block ``(i, j)`` covers ``[i b, (i+1) b) x [j b, (j+1) b)``. The terrain repeats every `PERIOD` blocks. `heights` is the
+    only height query: the scan, the simulators' boxes, the renderer and the tests all use it.
+
+    Args:
+        config: the terrain's settings; `infill` and `height_range` start every world and can be changed per world.
+        num_worlds: number of worlds, N.
+        seed: the terrains' seed.
+        device: where the height table lives.
+    """
+
+    PERIOD = 64
+    """Blocks after which the terrain repeats, in x and in y (12.8 m with 0.2 m blocks)."""
+
+    def __init__(self, config: TerrainConfig, num_worlds: int, *, seed: int = 0, device: str | torch.device = "cpu") -> None:
+        config.validate()
+        self.config = config
+        self.num_worlds = num_worlds
+        self.seed = seed
+        self.device = torch.device(device)
+        self.infill = torch.full((num_worlds,), config.infill, device=self.device)
+        """Per-world infill [N], used at a world's next `regenerate`."""
+        self.height_range = torch.full((num_worlds,), config.height_range, device=self.device)
+        """Per-world height range [m], [N], used at a world's next `regenerate`."""
+        self.episode = torch.full((num_worlds,), -1, dtype=torch.long, device=self.device)
+        """Number of the terrain that each world stands on [N]; -1 before the first `regenerate`."""
+        self.max_height = torch.zeros(num_worlds, device=self.device)
+        """Upper bound of the block tops of each world's present terrain [m], [N]."""
+        self._table = torch.zeros(num_worlds, self.PERIOD * self.PERIOD, device=self.device)
+        self._platform = self._platform_cells()
+
+    def regenerate(self, worlds: Tensor) -> None:
+        """Give each of the worlds its next terrain.
+
+        Args:
+            worlds: indices of the worlds, [K].
+        """
+        self.episode[worlds] += 1
+        self._build(worlds)
+
+    def set_episode(self, episode: Tensor, infill: Tensor, height_range: Tensor) -> None:
+        """Restore every world's terrain from its number and difficulty, each [N]."""
+        self.episode.copy_(episode)
+        self.infill.copy_(infill)
+        self.height_range.copy_(height_range)
+        self._build(torch.arange(self.num_worlds, device=self.device))
+
+    def heights(self, xy: Tensor, worlds: Tensor | None = None) -> Tensor:
+        """Height of the ground.
+
+        Args:
+            xy: world positions [m], [K, ..., 2].
+            worlds: the worlds they lie in, [K]; None for all.
+
+        Returns:
+            Height of the block top, or ``-gap_depth`` over a gap [m], [K, ...].
+        """
+        return self.block_heights(torch.floor(xy * (1.0 / self.config.block_size)).long(), worlds)
+
+    def block_heights(self, blocks: Tensor, worlds: Tensor | None = None) -> Tensor:
+        """Height of blocks given by their integer indices.
+
+        Args:
+            blocks: block indices (i, j), [K, ..., 2].
+            worlds: the worlds they lie in, [K]; None for all.
+
+        Returns:
+            Block tops [m], [K, ...].
+        """
+        index = (blocks[..., 0] & (self.PERIOD - 1)) * self.PERIOD + (blocks[..., 1] & (self.PERIOD - 1))
+        table = self._table if worlds is None else self._table[worlds]
+        return table.gather(1, index.reshape(len(index), -1)).reshape(index.shape)
+
+    def _build(self, worlds: Tensor) -> None:
+        key = _hash(_hash(_hash(torch.full_like(worlds, self.seed)) ^ worlds) ^ self.episode[worlds])[:, None]
+        cells = torch.arange(self.PERIOD * self.PERIOD, device=self.device)[None]
+        presence, height = _uniform(_hash(key ^ _hash(2 * cells))), _uniform(_hash(key ^ _hash(2 * cells + 1)))
+        height_range = self.height_range[worlds]
+        tops = (height - 0.5) * height_range[:, None]
+        tops = torch.where(presence < self.infill[worlds][:, None], tops, -self.config.gap_depth)
+        self._table[worlds] = torch.where(self._platform, 0.0, tops)
+        self.max_height[worlds] = height_range / 2
+
+    def _platform_cells(self) -> Tensor:
+        """Mask of the start platform's blocks in the table, [PERIOD * PERIOD]."""
+        centre = torch.arange(self.PERIOD, device=self.device).float() + 0.5
+        centre = torch.where(centre > self.PERIOD / 2, centre - self.PERIOD, centre) * self.config.block_size
+        in_x, in_y = centre.abs() < self.config.platform_length / 2, centre.abs() < self.config.platform_width / 2
+        return (in_x[:, None] & in_y[None]).flatten()
+
+
+def _hash(x: Tensor) -> Tensor:
+    """The 32-bit integer hash "lowbias32" (Wellons 2018), on int64 tensors."""
+    mask = 0xFFFFFFFF
+    x = x & mask
+    x = ((x ^ (x >> 16)) * 0x7FEB352D) & mask
+    x = ((x ^ (x >> 15)) * 0x846CA68B) & mask
+    return x ^ (x >> 16)
+
+
+def _uniform(bits: Tensor) -> Tensor:
+    """32 random bits to a float32 in [0, 1)."""
+    return (bits >> 8).float() * (1.0 / (1 << 24))

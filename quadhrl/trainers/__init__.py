@@ -1,0 +1,1 @@
+"""Training with TorchRL's PPO."""

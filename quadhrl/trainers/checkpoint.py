@@ -1,0 +1,112 @@
+"""Checkpoints: what is in them, and loading a policy from one with every check that a stranger's file needs."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
+
+from quadhrl.errors import InputError
+from quadhrl.envs.scan import SCAN_POINTS
+from quadhrl.envs.trajectory_generator import ACTION_DIM
+from quadhrl.policies import ActorCritic
+from quadhrl.trainers.config import TrainConfig, config_from_dict
+
+__all__ = ["FORMAT_VERSION", "LoadedPolicy", "find_checkpoint", "load_networks", "metadata", "read_metadata", "rotation"]
+
+FORMAT_VERSION = 1
+"""Version of the checkpoints' content; raise it when old files can no longer be read."""
+
+OBSERVATIONS = {"footstep": {"proprioception": 80, "goal": 12, "scan": 4 * SCAN_POINTS}}
+"""Observation keys and sizes of each task's networks, in input order."""
+
+
+@dataclass(frozen=True)
+class LoadedPolicy:
+    """Networks from a checkpoint, and what they were trained as."""
+
+    networks: ActorCritic
+    config: TrainConfig
+    metadata: dict[str, Any]
+    """Samples, wall time and scores at the time of saving."""
+
+
+def build_networks(config: TrainConfig) -> ActorCritic:
+    """Fresh networks for a config's task."""
+    return ActorCritic(OBSERVATIONS[config.task], ACTION_DIM, config.network)
+
+
+def rotation(directory: Path) -> CheckpointRotation:
+    """The checkpoints of a run directory: the last two and the best by reward."""
+    return CheckpointRotation(directory / "checkpoints", keep_last=2, keep_best=("reward", "max"))
+
+
+def metadata(config: TrainConfig, **facts: Any) -> dict[str, Any]:
+    """A checkpoint's metadata: its format, the run's config, and facts such as samples and reward."""
+    return {"quadhrl_format": FORMAT_VERSION, "task": config.task, "config": dataclasses.asdict(config), **facts}
+
+
+def find_checkpoint(path: str | Path, field: str = "checkpoint") -> Path:
+    """The checkpoint file itself, or the newest one of a run directory.
+
+    Raises:
+        InputError: there is none.
+    """
+    path = Path(path)
+    if path.is_file():
+        return path
+    if path.is_dir():
+        newest = rotation(path).latest()
+        if newest is not None:
+            return newest
+        raise InputError(field, str(path), "no checkpoint in this run directory; give another one")
+    raise InputError(field, str(path), "no such file or run directory; give the path of a checkpoint (*.ckpt)")
+
+
+def read_metadata(path: Path, field: str = "checkpoint") -> dict[str, Any]:
+    """A checkpoint's metadata, after checking that it is one of ours and of this version.
+
+    Raises:
+        InputError: the file is damaged, not a checkpoint of this package, or of another version.
+    """
+    try:
+        manifest = Checkpoint.manifest(path)
+    except Exception as error:  # zip, JSON, Unicode, key and OS errors: all mean that the file is not readable
+        raise InputError(field, str(path), "the file is damaged or no checkpoint; give another one") from error
+    facts = manifest.get("metadata") or {}
+    if facts.get("quadhrl_format") != FORMAT_VERSION:
+        remedy = f"its format is {facts.get('quadhrl_format')!r}, this version reads {FORMAT_VERSION}; use the version that wrote it"
+        raise InputError(field, str(path), remedy)
+    return facts
+
+
+def load_networks(
+    path: str | Path, *, task: str | None = None, device: torch.device | str = "cpu", field: str = "checkpoint"
+) -> LoadedPolicy:
+    """Load the networks of a checkpoint file or of a run directory's newest checkpoint.
+
+    Args:
+        path: checkpoint file or run directory.
+        task: the task that it must have been trained for; None for any.
+        device: where the networks go.
+        field: what the user calls this input, for error messages.
+
+    Raises:
+        InputError: the file is missing, damaged, or of another version or task.
+    """
+    path = find_checkpoint(path, field)
+    facts = read_metadata(path, field)
+    if task is not None and facts["task"] != task:
+        raise InputError(field, str(path), f"it was trained for the task {facts['task']!r}; give one for {task!r}")
+    config = config_from_dict(facts["config"], where=f"{field} {path}")
+    networks = build_networks(config)
+    try:
+        Checkpoint(networks=networks).load(path, components={"networks"}, map_location="cpu")
+    except (CheckpointError, RuntimeError, OSError, ValueError, KeyError, EOFError) as error:
+        raise InputError(field, str(path), "the file is damaged; give another one") from error
+    facts = {name: value for name, value in facts.items() if name != "config"}
+    return LoadedPolicy(networks.to(device).eval(), config, facts)

@@ -1,0 +1,260 @@
+"""Proximal policy optimisation: ``python -m quadhrl.trainers.ppo`` (paper, section II-A).
+
+Collector -> GAE -> ClipPPOLoss -> Adam with a learning rate that follows the KL divergence.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import signal
+import sys
+import time
+import warnings
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.checkpoint import Checkpoint, GlobalRNGState
+from torchrl.collectors import Collector
+from torchrl.objectives import ClipPPOLoss
+
+from quadhrl.envs import FootstepEnv
+from quadhrl.errors import InputError, command_line
+from quadhrl.sim import Fault, resolve_device
+from quadhrl.trainers.advantage import add_advantages
+from quadhrl.trainers.checkpoint import build_networks, find_checkpoint, load_networks, read_metadata
+from quadhrl.trainers.config import TrainConfig, flag_value, parse_command_line
+from quadhrl.trainers.progress import TrainingProgress
+from quadhrl.trainers.run_directory import RunDirectory, read_run_config
+from quadhrl.trainers.statistics import rollout_statistics
+
+__all__ = ["PPOTrainer", "main"]
+
+logger = logging.getLogger(__name__)
+
+
+class PPOTrainer:
+    """Environment, networks, loss and optimiser of one run, and its position in it.
+
+    Args:
+        config: the run's settings.
+
+    Raises:
+        InputError: a setting is out of its range.
+    """
+
+    def __init__(self, config: TrainConfig) -> None:
+        config.validate()
+        self.config = config
+        self.device = resolve_device(config.device)
+        torch.manual_seed(config.seed)
+        self.env = FootstepEnv(
+            config.env, config.num_envs, engine=config.engine, device=self.device, seed=config.seed
+        )
+        if config.init_from:
+            self.networks = load_networks(config.init_from, task=config.task, field="--init-from").networks.train()
+        else:
+            self.networks = build_networks(config)
+        self.networks.to(self.device)
+        self.collector = Collector(
+            self.env,
+            self.networks.policy(),
+            frames_per_batch=config.num_envs * config.ppo.horizon,
+            total_frames=-1,
+            device=self.device,
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
+        )
+        self._batches = iter(self.collector)
+        ppo = config.ppo
+        self.loss = ClipPPOLoss(
+            self.networks.actor,
+            self.networks.critic,
+            clip_epsilon=ppo.clip_epsilon,
+            entropy_bonus=ppo.entropy_coeff > 0,
+            entropy_coeff=ppo.entropy_coeff,
+            critic_coeff=ppo.critic_coeff,
+            loss_critic_type="l2",
+            normalize_advantage=False,
+        )
+        self.loss.set_keys(value="normalized_value", value_target="normalized_target")
+        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=ppo.learning_rate, eps=1e-8)
+        self.samples = 0
+        """Samples trained on so far."""
+        self.wall_seconds = 0.0
+        """Time spent in `iterate` so far, over all resumes [s]."""
+
+    def iterate(self) -> dict[str, float]:
+        """Collect one batch, update the networks with it, and return the scalars that describe both."""
+        began = time.perf_counter()
+        if not bool(self.networks.normalizer.module.statistics.count):
+            self._initialize_normalizer()
+        batch = next(self._batches)
+        collected = time.perf_counter()
+        scalars = rollout_statistics(batch, self.config.env.physics.control_dt)
+        scalars |= self.update(batch)
+        # Only now: the update must see the same features as the collection did, or its ratios would not begin at 1.
+        self.networks.normalizer.module.update(*(batch[key] for key in self.networks.observations))
+        self.samples += batch.numel()
+        ended = time.perf_counter()
+        self.wall_seconds += ended - began
+        scalars |= {
+            "perf/steps_per_second": batch.numel() / (ended - began),
+            "perf/collection_seconds": collected - began,
+            "perf/update_seconds": ended - collected,
+            "curriculum/level": self.env.curriculum.level.mean().item(),
+        }
+        for kind, count in zip(Fault, self.env.sim.fault_counts.tolist(), strict=True):
+            scalars[f"faults/{kind.name}".lower()] = count
+        return scalars
+
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """Improve the networks with a rollout [N, T]; returns the update's scalars."""
+        ppo, networks = self.config.ppo, self.networks
+        add_advantages(batch, networks, gamma=ppo.gamma, lmbda=ppo.lmbda)
+        statistics, target = networks.value_statistics, batch["value_target"]
+        explained = 1.0 - (target - batch["state_value"]).var() / target.var().clamp(min=1e-8)
+        statistics.update(target)
+        advantage = batch["advantage"]
+        data = batch.select("features", "action", "action_log_prob", "loc", "scale").reshape(-1)
+        data["normalized_target"] = ((target - statistics.mean) / statistics.std).reshape(-1, 1)
+        data["advantage"] = ((advantage - advantage.mean()) / advantage.std().clamp(min=1e-8)).reshape(-1, 1)
+
+        sums: dict[str, float] = {}
+        updates = skipped = 0
+        for _ in range(ppo.epochs):
+            order = torch.randperm(len(data), device=self.device)
+            for rows in order.chunk(ppo.minibatches):
+                losses = self.loss(data[rows])
+                loss = sum(value for key, value in losses.items() if key.startswith("loss_"))
+                self.optimizer.zero_grad()
+                loss.backward()
+                norm = torch.nn.utils.clip_grad_norm_(self.loss.parameters(), ppo.max_grad_norm)
+                if not math.isfinite(norm):
+                    skipped += 1
+                    continue
+                self.optimizer.step()
+                kl = float(losses["kl_approx"])
+                if updates > 0:  # before the batch's first step the divergence is zero by construction
+                    self._adapt_learning_rate(kl)
+                updates += 1
+                for name in ("loss_objective", "loss_critic", "kl_approx", "clip_fraction"):
+                    sums[name] = sums.get(name, 0.0) + float(losses[name])
+        if updates == 0:
+            raise FloatingPointError("every gradient of this batch is non-finite; resume from the last checkpoint")
+        means = {f"update/{name.removesuffix('_approx')}": value / updates for name, value in sums.items()}
+        return means | {
+            "update/learning_rate": self.learning_rate,
+            "update/explained_variance": explained.item(),
+            "update/skipped": float(skipped),
+            "policy/std": networks.actor[0].module.log_std.exp().mean().item(),
+        }
+
+    @property
+    def learning_rate(self) -> float:
+        """The optimiser's present learning rate."""
+        return self.optimizer.param_groups[0]["lr"]
+
+    def checkpoint(self) -> Checkpoint:
+        """Everything that a resumed run needs, for `Checkpoint.save` and `Checkpoint.load`."""
+        return Checkpoint(
+            format="archive",
+            networks=self.networks,
+            optimizer=self.optimizer,
+            env=self.env,
+            rng=GlobalRNGState(),
+            position=self,
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """The run's position, beside what has a state of its own."""
+        return {"samples": self.samples, "wall_seconds": self.wall_seconds}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the run's position."""
+        self.samples, self.wall_seconds = int(state["samples"]), float(state["wall_seconds"])
+
+    def load(self, path: Any) -> None:
+        """Carry on exactly where the checkpoint was saved."""
+        self.checkpoint().load(path, map_location=self.device)
+        self.collector.reset(keep_state=True)
+
+    def _adapt_learning_rate(self, kl: float) -> None:
+        ppo, rate = self.config.ppo, self.learning_rate
+        if kl > 2.0 * ppo.target_kl:
+            rate = max(rate / 1.5, ppo.min_learning_rate)
+        elif kl < 0.5 * ppo.target_kl:
+            rate = min(rate * 1.5, ppo.max_learning_rate)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+
+    def _initialize_normalizer(self) -> None:
+        """Spend one batch on the observation statistics alone; it is not trained on and does not count."""
+        batch = next(self._batches)
+        self.networks.normalizer.module.update(*(batch[key] for key in self.networks.observations))
+
+
+class _StopRequest:
+    """Turns the first Ctrl-C (or SIGTERM) into a flag; the second one interrupts at once."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._handle)
+
+    def _handle(self, number: int, _frame: object) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+
+
+def train(config: TrainConfig) -> None:
+    """Run training to its end, or to the first Ctrl-C, saving checkpoints on the way."""
+    resume_from = find_checkpoint(config.resume, "--resume") if config.resume else None
+    trainer = PPOTrainer(config)
+    if resume_from is not None:
+        read_metadata(resume_from, "--resume")
+        trainer.load(resume_from)
+    directory = RunDirectory(config)
+    stop = _StopRequest()
+    best = {"reward": -math.inf}
+
+    def save() -> None:
+        directory.save(checkpoint, trainer.samples, wall_seconds=trainer.wall_seconds, **best)
+
+    checkpoint = trainer.checkpoint()
+    last_save = time.monotonic()
+    with TrainingProgress(config.total_steps, trainer.samples) as progress:
+        sim = trainer.env.sim
+        progress.message(f"run {directory.path}: {config.num_envs} worlds, {sim.engine} engine, {trainer.device}")
+        while trainer.samples < config.total_steps and not stop.requested:
+            scalars = trainer.iterate()
+            best = {"reward": scalars["rollout/reward"]}
+            directory.log(scalars, trainer.samples)
+            progress.update(trainer.samples, scalars)
+            if time.monotonic() - last_save > 60.0 * config.checkpoint_minutes:
+                save()
+                last_save = time.monotonic()
+        save()
+    if stop.requested:
+        print(f"stopped at {trainer.samples} samples; carry on with: --resume {directory.path}")
+    else:
+        print(f"done: {trainer.samples} samples in {trainer.wall_seconds:.0f} s, see {directory.path}")
+
+
+def main() -> None:
+    """Command line of the trainer."""
+
+    def run() -> None:
+        resume = flag_value(sys.argv[1:], "--resume")
+        config = parse_command_line(read_run_config(resume) if resume else None)
+        train(config)
+
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    warnings.filterwarnings("ignore", category=FutureWarning, module="torchrl")
+    command_line(run)
+
+
+if __name__ == "__main__":
+    main()
