@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from quadhrl.envs import rewards
 from quadhrl.envs.curriculum import CurriculumConfig, TerrainCurriculum
 from quadhrl.envs.kinematics import RollPitchYaw, roll_pitch_yaw, rotate_yaw
+from quadhrl.envs.threads import one_thread_for_small_batches
 from quadhrl.envs.scan import SCAN_POINTS, scan, scan_pattern
 from quadhrl.envs.trajectory_generator import ACTION_DIM, TrajectoryGenerator, TrajectoryGeneratorConfig
 from quadhrl.errors import InputError
@@ -224,7 +225,9 @@ class LocomotionEnv(EnvBase):
         self.step_count[worlds] = 0
         self._reset_task(worlds)
         fresh = self._observe(worlds)
-        fresh["reward_terms"] = TensorDict({name: torch.zeros(len(worlds), 1, device=self.device) for name in self.reward_names})
+        fresh["reward_terms"] = TensorDict(
+            {name: torch.zeros(len(worlds), 1, device=self.device) for name in self.reward_names}
+        )
         none = torch.zeros(len(worlds), 1, dtype=torch.bool, device=self.device)
         fresh["events"] = TensorDict({name: none.clone() for name in self.event_names} | {"step_count": none.long()})
         if len(worlds) == self.num_envs:
@@ -236,6 +239,10 @@ class LocomotionEnv(EnvBase):
         return self._with_done(observation.clone())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        with one_thread_for_small_batches(self.num_envs, self.device):
+            return self._control_step(tensordict)
+
+    def _control_step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict["action"].nan_to_num(0.0).clamp(-1.0, 1.0)
         before = self.sim.readings
         now = self.sim.step(self.generator.joint_targets(action, self._attitude))
@@ -243,7 +250,9 @@ class LocomotionEnv(EnvBase):
         self._attitude = roll_pitch_yaw(now.base_quaternion)
 
         trusted = self.sim.fault == 0  # a faulty world was put back to its home: its reward would be nonsense
-        terms = {name: torch.where(trusted, term, 0.0) for name, term in self._reward_terms(before, now, action).items()}
+        terms = {
+            name: torch.where(trusted, term, 0.0) for name, term in self._reward_terms(before, now, action).items()
+        }
         self._previous_action = torch.stack([action, self._previous_action[:, 0]], 1)
         events = self._shared_events(now) | self._task_events()
         terminated = torch.stack([events[name] for name in self.terminal_events]).any(0)
@@ -259,7 +268,9 @@ class LocomotionEnv(EnvBase):
         out["reward"] = torch.stack(list(terms.values())).sum(0)[:, None]
         return out
 
-    def _with_done(self, out: TensorDict, terminated: Tensor | None = None, truncated: Tensor | None = None) -> TensorDict:
+    def _with_done(
+        self, out: TensorDict, terminated: Tensor | None = None, truncated: Tensor | None = None
+    ) -> TensorDict:
         none = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         out["terminated"] = none if terminated is None else terminated
         out["truncated"] = none.clone() if truncated is None else truncated
@@ -316,14 +327,13 @@ class LocomotionEnv(EnvBase):
         """
         yaw = self._attitude.yaw[worlds][:, None]
         cos, sin = torch.cos(yaw), torch.sin(yaw)
-        hips = rotate_vectors(readings.base_quaternion, self._hip_offset) + readings.base_position[:, None]
-        feet = rotate_yaw(readings.foot_position - hips, cos, -sin)
-        velocity = rotate_yaw(readings.foot_velocity, cos, -sin)
-        spin = rotate_vectors(readings.base_quaternion, readings.base_angular_velocity[:, None])
-        spin = rotate_yaw(spin, cos, -sin)[:, 0, :2]
+        in_base = torch.cat([self._hip_offset.expand(len(cos), -1, -1), readings.base_angular_velocity[:, None]], 1)
+        in_world = rotate_vectors(readings.base_quaternion, in_base)
+        feet = readings.foot_position - readings.base_position[:, None] - in_world[:, :4]
+        level = rotate_yaw(torch.cat([feet, readings.foot_velocity, in_world[:, 4:]], 1), cos, -sin).flatten(1)
         angles = torch.stack([self._attitude.roll[worlds], self._attitude.pitch[worlds]], -1)
         contact = (readings.foot_force[..., 2] > 0).float()
-        return [feet.flatten(1), velocity.flatten(1), readings.joint_torque, angles, spin, contact]
+        return [level[:, :24], readings.joint_torque, angles, level[:, 24:26], contact]
 
     def _phase_and_actions(self, worlds: Tensor) -> list[Tensor]:
         phi = 2.0 * torch.pi * self.generator.phase[worlds][:, None]
@@ -368,9 +378,7 @@ class LocomotionEnv(EnvBase):
 
 
 def rotate_vectors(quaternion: Tensor, vectors: Tensor) -> Tensor:
-    """Rotate vectors [M, 3] or [N, M, 3] by quaternions wxyz [N, 4]; the result is [N, M, 3]."""
-    w, axis = quaternion[:, None, :1], quaternion[:, None, 1:]
-    vectors = vectors.expand(len(quaternion), -1, -1)
-    axis = axis.expand_as(vectors)
+    """Rotate vectors [N, M, 3] by quaternions wxyz [N, 4]."""
+    w, axis = quaternion[:, None, :1], quaternion[:, None, 1:].expand_as(vectors)
     twice = 2.0 * torch.linalg.cross(axis, vectors)
     return vectors + w * twice + torch.linalg.cross(axis, twice)

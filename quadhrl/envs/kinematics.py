@@ -88,5 +88,7 @@ class LegKinematics:
         abduction = torch.atan2(y, -z) - torch.atan2(self.offset, down)
         cos_calf = (x * x + down * down - self.thigh**2 - self.calf**2) / (2 * self.thigh * self.calf)
         calf = -torch.acos(cos_calf.clamp(-1.0, 1.0))
-        thigh = torch.atan2(-x, down) - torch.atan2(self.calf * torch.sin(calf), self.thigh + self.calf * torch.cos(calf))
+        thigh = torch.atan2(-x, down) - torch.atan2(
+            self.calf * torch.sin(calf), self.thigh + self.calf * torch.cos(calf)
+        )
         return torch.stack([abduction, thigh, calf], -1)

@@ -25,9 +25,7 @@ def scan_pattern(device: torch.device | str = "cpu") -> Tensor:
     return torch.tensor(points, device=device)
 
 
-def scan(
-    terrain: BlockTerrain, feet: Tensor, pattern: Tensor, clip: float, worlds: Tensor | None = None
-) -> Tensor:
+def scan(terrain: BlockTerrain, feet: Tensor, pattern: Tensor, clip: float, worlds: Tensor | None = None) -> Tensor:
     """Height of the feet above the ground around them.
 
     Args:
@@ -40,5 +38,9 @@ def scan(
     Returns:
         [K, 284], m, foot by foot.
     """
-    xy = feet[:, :, None, :2] + pattern
-    return (feet[:, :, None, 2] - terrain.heights(xy, worlds)).clamp_(-clip, clip).flatten(1)
+    x, y, z = (feet[..., k, None] for k in range(3))
+    xy = torch.stack(
+        [x + pattern[:, 0], y + pattern[:, 1]]
+    )  # coordinates outermost: both passes over them are contiguous
+    heights = terrain.heights(xy.movedim(0, -1), worlds)
+    return heights.neg_().add_(z).clamp_(-clip, clip).flatten(1)

@@ -102,7 +102,9 @@ class FootstepTargets:
         Args:
             hit: [N], bool.
         """
-        arrived = torch.zeros_like(self.position).scatter_(1, self.stance_feet[..., None].expand(-1, -1, 2), self.following)
+        arrived = torch.zeros_like(self.position).scatter_(
+            1, self.stance_feet[..., None].expand(-1, -1, 2), self.following
+        )
         stance = ~self.active
         self.position = torch.where((hit[:, None] & stance)[..., None], arrived, self.position)
         self.index = self.index + hit

@@ -103,7 +103,9 @@ class TrajectoryGenerator:
         self.phase = (self.phase + self.frequency * self.control_dt) % 1.0
         p = self.leg_phase
         x = amplitude[:, None] * stride(p)
-        z = height[:, None] + c.step_height * lift(p) + self._foot_radius  # heights are those of the sphere's lowest point
+        z = (
+            height[:, None] + c.step_height * lift(p) + self._foot_radius
+        )  # heights are those of the sphere's lowest point
         feet = torch.stack([x, self._stance_y.expand_as(x), z], -1) + c.max_residual * action[:, 3:].view(-1, 4, 3)
         feet = self.kinematics.clip(_level_to_base(feet, attitude))
         return self.kinematics.inverse(feet).flatten(1)

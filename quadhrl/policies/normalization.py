@@ -40,7 +40,9 @@ class RunningStatistics(nn.Module):
         The two halves are merged as in Chan et al. 1979.
         """
         rows = rows.reshape(-1, rows.shape[-1])
-        rows = rows[torch.isfinite(rows).all(-1)]
+        finite = torch.isfinite(rows.sum(-1))  # a sum keeps every NaN and infinity
+        if not finite.all():
+            rows = rows[finite]
         if len(rows) == 0:
             return
         variance, mean = torch.var_mean(rows, 0, correction=0)
@@ -56,19 +58,23 @@ class ObservationNormalizer(nn.Module):
 
     Args:
         sizes: number of entries of each observation, in the order in which they are passed.
+        gains: factor on each observation's normalised entries.
     """
 
     CLIP = 5.0
+    gain: Tensor
 
-    def __init__(self, sizes: list[int]) -> None:
+    def __init__(self, sizes: list[int], gains: list[float]) -> None:
         super().__init__()
         self.statistics = RunningStatistics(sum(sizes))
+        entries = [torch.full((size,), gain) for size, gain in zip(sizes, gains, strict=True)]
+        self.register_buffer("gain", torch.cat(entries))
 
     def forward(self, *observations: Tensor) -> Tensor:
         """Normalised features [..., sum(sizes)]."""
         statistics = self.statistics
         features = torch.cat(observations, -1)
-        return features.sub_(statistics.mean).div_(statistics.std).clamp_(-self.CLIP, self.CLIP)
+        return features.sub_(statistics.mean).mul_(1.0 / statistics.std).clamp_(-self.CLIP, self.CLIP).mul_(self.gain)
 
     def update(self, *observations: Tensor) -> None:
         """Take the observations into the statistics."""

@@ -32,7 +32,7 @@ class NativeSimulator(Simulator):
         self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._sensors = self.batch.bind("sensordata")
         self._torque = self.batch.bind("actuator_force")
-        self._block_position = self.batch.expand("geom_pos")
+        self._geom_pos, self._geom_size = self.batch.expand("geom_pos"), self.batch.expand("geom_size")
         # The world body's bounding volumes must follow its boxes, or the mid-phase misses contacts.
         model = scene.model
         self._bvh = self.batch.expand("bvh_aabb")
@@ -92,16 +92,19 @@ class NativeSimulator(Simulator):
 
     def _forces(self) -> dict[str, Tensor]:
         sensors = torch.from_numpy(self._sensors[:, 24:].astype(np.float32))
-        touched = torch.zeros(self.num_worlds, self.scene.num_links).index_add_(1, self._link_of_sensor, sensors[:, 12:])
+        touched = torch.zeros(self.num_worlds, self.scene.num_links).index_add_(
+            1, self._link_of_sensor, sensors[:, 12:]
+        )
         return {
             "joint_torque": torch.from_numpy(self._torque.astype(np.float32)),
             "foot_force": -sensors[:, :12].view(-1, 4, 3),  # the sensor reports the force that the foot exerts
             "collisions": (touched > 0).sum(-1),
         }
 
-    def _place_blocks(self, worlds: Tensor, centre: Tensor, position: Tensor) -> None:
+    def _place_blocks(self, worlds: Tensor, centre: Tensor, position: Tensor, half_size: Tensor) -> None:
         ids = worlds.numpy()
-        self._block_position[np.ix_(ids, self.scene.blocks)] = position.numpy()
+        boxes = np.ix_(ids, self.scene.blocks)
+        self._geom_pos[boxes], self._geom_size[boxes] = position.numpy(), half_size.numpy()
         nodes = self._bvh[:, self._world_nodes]
         shift = centre.numpy() * self.terrain.config.block_size
         nodes[ids, :, :2] = self._node_xy + shift[:, None]

@@ -14,7 +14,10 @@ from quadhrl.sim.terrain import TerrainConfig
 __all__ = ["PhysicsConfig", "Scene", "build_scene"]
 
 WINDOW = 8
-"""Blocks along each side of the window that follows a robot: with 0.2 m blocks at least 0.7 m of ground on every side."""
+"""Blocks along each side of the window that follows a robot: with 0.2 m blocks at least 0.65 m of ground on every side."""
+
+BLOCK_OVERLAP = 0.05
+"""How far a block's box reaches under those neighbours that are at least as high [m]; see `Simulator`."""
 
 
 @dataclass
@@ -29,9 +32,9 @@ class PhysicsConfig:
     """Most Newton iterations per physics step (it usually stops after two or three)."""
     line_search_iterations: int = 20
     """Most line-search iterations per Newton iteration."""
-    nconmax: int = 48
+    nconmax: int = 64
     """Contacts and candidate pairs per world that the warp engine has room for (pooled over the worlds)."""
-    njmax: int = 128
+    njmax: int = 256
     """Constraint rows per world that the warp engine has room for."""
 
     def validate(self) -> None:
@@ -89,8 +92,8 @@ def build_scene(
 ) -> Scene:
     """Compile the robot, its servos and contact sensors, and a window of static block boxes.
 
-    The boxes are geoms of the world body, whose positions the simulators write per world: static geoms cost half of what
-    mocap bodies do on the native engine.
+    The boxes are geoms of the world body, whose positions and sizes the simulators write per world: static geoms cost half
+    of what mocap bodies do on the native engine. They are compiled at their largest, so that the bounding volumes hold.
 
     Args:
         robot: the robot.
@@ -111,7 +114,8 @@ def build_scene(
     _add_servos(spec, robot)
     _add_blocks(spec, terrain, window)
     link_geoms = [
-        geom.name for geom in spec.geoms
+        geom.name
+        for geom in spec.geoms
         if (geom.contype or geom.conaffinity) and geom.name not in robot.feet and not geom.name.startswith("block_")
     ]
     if "" in link_geoms:
@@ -119,7 +123,9 @@ def build_scene(
     _add_sensors(spec, robot, link_geoms)
     model = spec.compile()
     links = model.geom_bodyid[[model.geom(name).id for name in link_geoms]]
-    offsets = np.stack(np.meshgrid(np.arange(window), np.arange(window), indexing="ij"), -1).reshape(-1, 2) - window // 2
+    offsets = (
+        np.stack(np.meshgrid(np.arange(window), np.arange(window), indexing="ij"), -1).reshape(-1, 2) - window // 2
+    )
     return Scene(
         model=model,
         robot=robot,
@@ -161,13 +167,13 @@ def _add_servos(spec: mujoco.MjSpec, robot: Robot) -> None:
 
 
 def _add_blocks(spec: mujoco.MjSpec, terrain: TerrainConfig, window: int) -> None:
-    half = terrain.block_size / 2
+    largest = terrain.block_size / 2 + BLOCK_OVERLAP
     for k in range(window * window):
         x, y = k // window - window // 2, k % window - window // 2
         spec.worldbody.add_geom(
             name=f"block_{k}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=[half, half, terrain.gap_depth / 2],
+            size=[largest, largest, terrain.gap_depth / 2],
             pos=[(x + 0.5) * terrain.block_size, (y + 0.5) * terrain.block_size, -terrain.gap_depth / 2],
             friction=[1.0, 0.005, 0.0001],
             rgba=[0.62, 0.58, 0.52, 1.0],
@@ -177,16 +183,27 @@ def _add_blocks(spec: mujoco.MjSpec, terrain: TerrainConfig, window: int) -> Non
 def _add_sensors(spec: mujoco.MjSpec, robot: Robot, link_geoms: list[str]) -> None:
     """Position, velocity and net contact force of each foot, and whether each link geom touches anything."""
     geom = mujoco.mjtObj.mjOBJ_GEOM
-    for kind, sensor_type in (("position", mujoco.mjtSensor.mjSENS_FRAMEPOS), ("velocity", mujoco.mjtSensor.mjSENS_FRAMELINVEL)):
+    for kind, sensor_type in (
+        ("position", mujoco.mjtSensor.mjSENS_FRAMEPOS),
+        ("velocity", mujoco.mjtSensor.mjSENS_FRAMELINVEL),
+    ):
         for foot in robot.feet:
             spec.add_sensor(name=f"{kind}_{foot}", type=sensor_type, objtype=geom, objname=foot)
     force, found = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
     net_force, any_contact = 3, 0  # reduction: in the world's frame, summed; none
     for foot in robot.feet:
         spec.add_sensor(
-            name=f"force_{foot}", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=geom, objname=foot, intprm=[force, net_force, 1]
+            name=f"force_{foot}",
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=geom,
+            objname=foot,
+            intprm=[force, net_force, 1],
         )
     for name in link_geoms:
         spec.add_sensor(
-            name=f"touch_{name}", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=geom, objname=name, intprm=[found, any_contact, 1]
+            name=f"touch_{name}",
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=geom,
+            objname=name,
+            intprm=[found, any_contact, 1],
         )

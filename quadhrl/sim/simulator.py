@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from quadhrl.sim.scene import Scene
+from quadhrl.sim.scene import BLOCK_OVERLAP, Scene
 from quadhrl.sim.terrain import BlockTerrain
 
 __all__ = ["Fault", "Readings", "Simulator"]
@@ -73,6 +73,11 @@ class Simulator(ABC):
     A world with a fault is put back to its home state at once, so that every reading is finite; `fault` keeps the reason
     until the next step and `fault_counts` counts them.
 
+    The terrain is a window of boxes that follows each robot. A sphere that sinks into a box by more than its radius is
+    pushed out through the nearest face, which at the seam of two level blocks is a side face of each: it would be
+    wedged between them, and feet sank by 10 cm on level ground. So every box reaches a little way under its neighbours
+    wherever that is hidden, where they are at least as high; the surface stays exactly that of `BlockTerrain.heights`.
+
     Args:
         scene: the compiled robot and terrain window.
         terrain: the terrains, one per world; regenerate a world's terrain before resetting the world.
@@ -94,6 +99,7 @@ class Simulator(ABC):
         self._home = torch.tensor(scene.home, device=device)
         self._centre = torch.zeros(self.num_worlds, 2, dtype=torch.long, device=device)
         self._block_offset = torch.as_tensor(scene.block_offset, device=device)
+        self._window = round(len(scene.blocks) ** 0.5)
         self.readings: Readings
         """The latest readings."""
 
@@ -112,16 +118,14 @@ class Simulator(ABC):
             The new readings, also kept as `readings`.
         """
         self._advance(joint_targets)
+        self.readings = Readings(**self._kinematics(), **self._forces())
         self.fault = self._find_faults()
         faulty = self.fault.nonzero().squeeze(-1)
         if len(faulty):
             for k, kind in enumerate(Fault):
                 self.fault_counts[k] += (self.fault & kind).bool().sum()
             self.reset(faulty)
-        else:
-            self._follow()
-        self.readings = Readings(**self._kinematics(), **self._forces())
-        self._silence(faulty)
+        self._follow()
         return self.readings
 
     def reset(self, worlds: Tensor, qpos: Tensor | None = None, qvel: Tensor | None = None) -> Readings:
@@ -139,9 +143,9 @@ class Simulator(ABC):
         qpos = home if qpos is None else qpos.to(self._home)
         qvel = self._home.new_zeros(len(worlds), self.scene.model.nv) if qvel is None else qvel.to(self._home)
         self._write(worlds, qpos, qvel, ctrl=self._home[7:].expand(len(worlds), -1))
-        self._follow(worlds)
         self._forward(worlds)
         self.readings = self.readings.replace(**self._kinematics())
+        self._follow(worlds)
         self._silence(worlds)
         return self.readings
 
@@ -151,6 +155,7 @@ class Simulator(ABC):
         return {
             "physics": self._state(),
             "readings": readings,
+            "centre": self._centre,
             "fault": self.fault,
             "fault_counts": self.fault_counts,
             "terrain": {
@@ -163,14 +168,14 @@ class Simulator(ABC):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` gave, from a simulator with the same scene and number of worlds."""
         self.terrain.set_episode(**state["terrain"])
-        self._load_state(state["physics"])
+        self.readings = Readings(**{name: value.to(self.device) for name, value in state["readings"].items()})
         everyone = torch.arange(self.num_worlds, device=self.device)
-        self._follow(everyone)
-        self._forward(everyone)
+        self._centre.copy_(state["centre"])
+        self._lay(everyone)
         self._load_state(state["physics"])
+        self._forward(everyone)
         self.fault.copy_(state["fault"])
         self.fault_counts.copy_(state["fault_counts"])
-        self.readings = Readings(**{name: value.to(self.device) for name, value in state["readings"].items()})
 
     @property
     @abstractmethod
@@ -207,8 +212,8 @@ class Simulator(ABC):
         """The readings that stem from the last physics step, of all worlds."""
 
     @abstractmethod
-    def _place_blocks(self, worlds: Tensor, centre: Tensor, position: Tensor) -> None:
-        """Put the window's boxes of some worlds at ``position`` [K, B, 3] around the block corner ``centre`` [K, 2]."""
+    def _place_blocks(self, worlds: Tensor, centre: Tensor, position: Tensor, half_size: Tensor) -> None:
+        """Lay the window of some worlds around the block corner ``centre`` [K, 2]: boxes' centres and half sizes [K, B, 3]."""
 
     @abstractmethod
     def _state(self) -> dict[str, Tensor]:
@@ -227,9 +232,12 @@ class Simulator(ABC):
                 self.readings = self.readings.replace(**{name: forces})
 
     def _find_faults(self) -> Tensor:
-        qpos, qvel = self.qpos, self.qvel
-        finite = torch.isfinite(qpos).all(-1) & torch.isfinite(qvel).all(-1)
-        runaway = (qvel[:, :3].norm(dim=-1) > 20.0) | (qvel[:, 3:].abs().amax(-1) > 200.0)
+        now = self.readings
+        velocity = torch.cat([now.base_angular_velocity, now.joint_velocity], -1)
+        # A sum keeps every NaN and infinity. Float32 turns what is too large for it into infinity.
+        total = torch.cat([now.base_position, now.base_quaternion, now.joint_position, now.base_velocity, velocity], -1)
+        finite = torch.isfinite(total.sum(-1))
+        runaway = (now.base_velocity.norm(dim=-1) > 20.0) | (velocity.abs().amax(-1) > 200.0)
         return (
             torch.where(finite, 0, int(Fault.NONFINITE))
             | torch.where(finite & runaway, int(Fault.RUNAWAY), 0)
@@ -242,15 +250,40 @@ class Simulator(ABC):
         Args:
             worlds: worlds whose window is laid anew whatever their robot did; None for those whose robot left its block.
         """
-        size = self.terrain.config.block_size
-        centre = torch.round(self.qpos[:, :2] / size).long()
+        at = self.readings.base_position[:, :2] / self.terrain.config.block_size
         if worlds is None:
-            worlds = (centre != self._centre).any(-1).nonzero().squeeze(-1)
+            # Half a block is enough to leave; the rest keeps a robot on an edge from moving its window at every step.
+            worlds = ((at - self._centre).abs() > 0.75).any(-1).nonzero().squeeze(-1)
             if len(worlds) == 0:
                 return
-        centre = centre[worlds]
-        self._centre[worlds] = centre
-        blocks = centre[:, None] + self._block_offset
-        tops = self.terrain.block_heights(blocks, worlds)
-        xy = (blocks + 0.5) * size
-        self._place_blocks(worlds, centre, torch.cat([xy, (tops - self.terrain.config.gap_depth / 2)[..., None]], -1))
+        self._centre[worlds] = torch.round(at[worlds]).long()
+        self._lay(worlds)
+
+    def _lay(self, worlds: Tensor) -> None:
+        """Lay the windows of some worlds around their `_centre`."""
+        centre = self._centre[worlds]
+        low, high = self._box_corners(centre, worlds)
+        self._place_blocks(worlds, centre, (low + high) / 2, (high - low) / 2)
+
+    def _box_corners(self, centre: Tensor, worlds: Tensor) -> tuple[Tensor, Tensor]:
+        """Lowest and highest corner of each box of the windows around the block corners ``centre`` [K, 2], [K, B, 3]."""
+        terrain, reach = self.terrain.config, self._window // 2 + 1
+        side = torch.arange(-reach, reach, device=self.device)  # the window and a ring around it
+        i, j = torch.meshgrid(side, side, indexing="ij")
+        around = self.terrain.block_heights(centre[:, None, None] + torch.stack([i, j], -1), worlds)
+        tops = around[:, 1:-1, 1:-1]
+
+        def hidden(di: int, dj: int) -> Tensor:
+            n = self._window
+            return around[:, 1 + di : 1 + di + n, 1 + dj : 1 + dj + n] >= tops
+
+        west, east = hidden(-1, 0), hidden(1, 0)
+        # A box that reaches out to two sides covers the corner between them as well: give one side up where it would show.
+        south = hidden(0, -1) & (hidden(-1, -1) | ~west) & (hidden(1, -1) | ~east)
+        north = hidden(0, 1) & (hidden(-1, 1) | ~west) & (hidden(1, 1) | ~east)
+        corner = (centre[:, None] + self._block_offset) * terrain.block_size
+        low_reach = torch.stack([west, south], -1).flatten(1, 2) * BLOCK_OVERLAP
+        high_reach = torch.stack([east, north], -1).flatten(1, 2) * BLOCK_OVERLAP
+        top = tops.flatten(1)[..., None]
+        low = torch.cat([corner - low_reach, top - terrain.gap_depth], -1)
+        return low, torch.cat([corner + terrain.block_size + high_reach, top], -1)

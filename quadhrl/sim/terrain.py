@@ -67,21 +67,24 @@ class BlockTerrain:
     PERIOD = 64
     """Blocks after which the terrain repeats, in x and in y (12.8 m with 0.2 m blocks)."""
 
-    def __init__(self, config: TerrainConfig, num_worlds: int, *, seed: int = 0, device: str | torch.device = "cpu") -> None:
+    def __init__(
+        self, config: TerrainConfig, num_worlds: int, *, seed: int = 0, device: str | torch.device = "cpu"
+    ) -> None:
         config.validate()
         self.config = config
         self.num_worlds = num_worlds
         self.seed = seed
         self.device = torch.device(device)
-        self.infill = torch.full((num_worlds,), config.infill, device=self.device)
+        self.infill = torch.full((num_worlds,), float(config.infill), device=self.device)
         """Per-world infill [N], used at a world's next `regenerate`."""
-        self.height_range = torch.full((num_worlds,), config.height_range, device=self.device)
+        self.height_range = torch.full((num_worlds,), float(config.height_range), device=self.device)
         """Per-world height range [m], [N], used at a world's next `regenerate`."""
         self.episode = torch.full((num_worlds,), -1, dtype=torch.long, device=self.device)
         """Number of the terrain that each world stands on [N]; -1 before the first `regenerate`."""
         self.max_height = torch.zeros(num_worlds, device=self.device)
         """Upper bound of the block tops of each world's present terrain [m], [N]."""
         self._table = torch.zeros(num_worlds, self.PERIOD * self.PERIOD, device=self.device)
+        self._everyone = torch.arange(num_worlds, dtype=torch.int32, device=self.device)
         self._platform = self._platform_cells()
 
     def regenerate(self, worlds: Tensor) -> None:
@@ -110,7 +113,9 @@ class BlockTerrain:
         Returns:
             Height of the block top, or ``-gap_depth`` over a gap [m], [K, ...].
         """
-        return self.block_heights(torch.floor(xy * (1.0 / self.config.block_size)).long(), worlds)
+        inverse = 1.0 / self.config.block_size
+        x, y = xy.unbind(-1)
+        return self._look_up((x * inverse).floor_().int(), (y * inverse).floor_().int(), worlds)
 
     def block_heights(self, blocks: Tensor, worlds: Tensor | None = None) -> Tensor:
         """Height of blocks given by their integer indices.
@@ -122,9 +127,14 @@ class BlockTerrain:
         Returns:
             Block tops [m], [K, ...].
         """
-        index = (blocks[..., 0] & (self.PERIOD - 1)) * self.PERIOD + (blocks[..., 1] & (self.PERIOD - 1))
-        table = self._table if worlds is None else self._table[worlds]
-        return table.gather(1, index.reshape(len(index), -1)).reshape(index.shape)
+        return self._look_up(blocks[..., 0].int(), blocks[..., 1].int(), worlds)
+
+    def _look_up(self, i: Tensor, j: Tensor, worlds: Tensor | None) -> Tensor:
+        """Table entries of the blocks (i, j), int32 [K, ...] each; overwrites ``i`` and ``j``."""
+        worlds = self._everyone if worlds is None else worlds.int()
+        row = worlds.view(-1, *[1] * (i.dim() - 1)) * (self.PERIOD * self.PERIOD)
+        index = i.bitwise_and_(self.PERIOD - 1).mul_(self.PERIOD).add_(j.bitwise_and_(self.PERIOD - 1)).add_(row)
+        return self._table.view(-1).index_select(0, index.view(-1)).view(index.shape)
 
     def _build(self, worlds: Tensor) -> None:
         key = _hash(_hash(_hash(torch.full_like(worlds, self.seed)) ^ worlds) ^ self.episode[worlds])[:, None]

@@ -87,12 +87,16 @@ class WarpSimulator(Simulator):
         model = copy.copy(scene.model)
         # The sensors serve the native engine; here the two kernels above read the same from the contacts.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
-        model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # unknown to MuJoCo-Warp, which never resets
+        model.opt.disableflags &= ~int(
+            mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        )  # unknown to MuJoCo-Warp, which never resets
         if device.type == "cpu":
-            logger.info("compiling MuJoCo-Warp for the CPU: the first run takes about a minute, later ones use the cache")
+            logger.info(
+                "compiling MuJoCo-Warp for the CPU: the first run takes about a minute, later ones use the cache"
+            )
         self._wp_device = wp.device_from_torch(device)
         with wp.ScopedDevice(self._wp_device):
-            self.model = mjw.put_model(model)
+            self.model = mjw.put_model(model, batch_sizes={"geom_size": self.num_worlds})
             self.model.opt.warn_overflow = False  # polled in _overflowed instead: printing floods and serialises
             physics = scene.physics
             self.data = mjw.make_data(model, self.num_worlds, nconmax=physics.nconmax, njmax=physics.njmax)
@@ -136,6 +140,7 @@ class WarpSimulator(Simulator):
             name: getattr(self.data, name)
             for name in ("qpos", "qvel", "ctrl", "qacc_warmstart", "time", "geom_xpos", "overflow", "actuator_force")
         }
+        shared["geom_size"] = self.model.geom_size
         readouts = {
             "foot_force": self._foot_force,
             "link_touched": self._link_touched,
@@ -224,9 +229,10 @@ class WarpSimulator(Simulator):
             "collisions": self._view["link_touched"].sum(-1),
         }
 
-    def _place_blocks(self, worlds: Tensor, centre: Tensor, position: Tensor) -> None:
+    def _place_blocks(self, worlds: Tensor, centre: Tensor, position: Tensor, half_size: Tensor) -> None:
         # Warp computes the poses of static geoms once, so writing them here moves the boxes for good.
-        self._view["geom_xpos"][worlds[:, None], self._blocks[None]] = position.float()
+        boxes = (worlds[:, None], self._blocks[None])
+        self._view["geom_xpos"][boxes], self._view["geom_size"][boxes] = position.float(), half_size.float()
 
     def _state(self) -> dict[str, Tensor]:
         return {name: self._view[name].clone() for name in ("qpos", "qvel", "ctrl", "qacc_warmstart", "time")}

@@ -16,7 +16,15 @@ from quadhrl.envs.trajectory_generator import ACTION_DIM
 from quadhrl.policies import ActorCritic
 from quadhrl.trainers.config import TrainConfig, config_from_dict
 
-__all__ = ["FORMAT_VERSION", "LoadedPolicy", "find_checkpoint", "load_networks", "metadata", "read_metadata", "rotation"]
+__all__ = [
+    "FORMAT_VERSION",
+    "LoadedPolicy",
+    "find_checkpoint",
+    "load_networks",
+    "metadata",
+    "read_metadata",
+    "rotation",
+]
 
 FORMAT_VERSION = 1
 """Version of the checkpoints' content; raise it when old files can no longer be read."""

@@ -36,7 +36,7 @@ class PPOConfig:
     """Coefficient of the entropy bonus."""
     critic_coeff: float = 1.0
     """Coefficient of the critic's mean squared error, in normalised units."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 5e-4
     """Learning rate at the start; it then follows the KL divergence."""
     min_learning_rate: float = 1e-5
     """Lower bound of the learning rate."""
@@ -83,6 +83,8 @@ class TrainConfig:
     """Number of worlds simulated at once."""
     total_steps: int = 20_000_000
     """Samples (control steps summed over worlds) to train for."""
+    max_minutes: float = 0.0
+    """Stop, with a checkpoint, after this time even if total_steps is not reached [min]; 0 for no limit."""
     seed: int = 0
     """Seed of networks, actions, targets and terrains."""
     log_dir: str = "logs"
@@ -113,6 +115,8 @@ class TrainConfig:
             raise InputError("--num-envs", self.num_envs, "give a whole number of at least 1")
         if self.total_steps < 1:
             raise InputError("--total-steps", self.total_steps, "give a whole number of at least 1")
+        if self.max_minutes < 0.0:
+            raise InputError("--max-minutes", self.max_minutes, "give a time above 0 min, or 0 for no limit")
         if self.checkpoint_minutes <= 0.0:
             raise InputError("--checkpoint-minutes", self.checkpoint_minutes, "give a time above 0 min")
         if self.num_envs * self.ppo.horizon < self.ppo.minibatches:
@@ -134,10 +138,12 @@ def _paper() -> TrainConfig:
 def _cpu() -> TrainConfig:
     """What learns fastest on a few cores: smaller updates, earlier ends of hopeless episodes, terrain by curriculum."""
     config = TrainConfig(preset="cpu")
-    config.ppo = PPOConfig(horizon=40, epochs=4, minibatches=4)
+    config.ppo = PPOConfig(horizon=24, epochs=3, minibatches=4, target_kl=0.015)
+    config.network.initial_std = 0.25
     config.env.termination.max_steps = 1200
     config.env.termination.stuck_seconds = 2.0
     config.env.termination.fall_height = 0.12
+    config.env.termination.max_tilt = 60.0
     config.env.curriculum.enabled = True
     return config
 
@@ -189,7 +195,9 @@ def config_from_dict(values: dict[str, Any], cls: Any = TrainConfig, where: str 
     known = {f.name for f in dataclasses.fields(cls)}
     for name in values:
         if name not in known:
-            raise InputError(f"{where}: field", name, "this version does not know it; use the version that wrote the file")
+            raise InputError(
+                f"{where}: field", name, "this version does not know it; use the version that wrote the file"
+            )
     nested = {
         name: config_from_dict(value, hints[name], where) if dataclasses.is_dataclass(hints[name]) else value
         for name, value in values.items()

@@ -20,7 +20,8 @@ from torchrl.collectors import Collector
 from torchrl.objectives import ClipPPOLoss
 
 from quadhrl.envs import FootstepEnv
-from quadhrl.errors import InputError, command_line
+from quadhrl.envs.threads import one_thread_for_small_batches
+from quadhrl.errors import command_line
 from quadhrl.sim import Fault, resolve_device
 from quadhrl.trainers.advantage import add_advantages
 from quadhrl.trainers.checkpoint import build_networks, find_checkpoint, load_networks, read_metadata
@@ -49,9 +50,7 @@ class PPOTrainer:
         self.config = config
         self.device = resolve_device(config.device)
         torch.manual_seed(config.seed)
-        self.env = FootstepEnv(
-            config.env, config.num_envs, engine=config.engine, device=self.device, seed=config.seed
-        )
+        self.env = FootstepEnv(config.env, config.num_envs, engine=config.engine, device=self.device, seed=config.seed)
         if config.init_from:
             self.networks = load_networks(config.init_from, task=config.task, field="--init-from").networks.train()
         else:
@@ -79,7 +78,7 @@ class PPOTrainer:
             normalize_advantage=False,
         )
         self.loss.set_keys(value="normalized_value", value_target="normalized_target")
-        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=ppo.learning_rate, eps=1e-8)
+        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=ppo.learning_rate, eps=1e-8, fused=True)
         self.samples = 0
         """Samples trained on so far."""
         self.wall_seconds = 0.0
@@ -90,7 +89,7 @@ class PPOTrainer:
         began = time.perf_counter()
         if not bool(self.networks.normalizer.module.statistics.count):
             self._initialize_normalizer()
-        batch = next(self._batches)
+        batch = self._collect()
         collected = time.perf_counter()
         scalars = rollout_statistics(batch, self.config.env.physics.control_dt)
         scalars |= self.update(batch)
@@ -124,6 +123,7 @@ class PPOTrainer:
         sums: dict[str, float] = {}
         updates = skipped = 0
         for _ in range(ppo.epochs):
+            epoch_kl: list[float] = []
             order = torch.randperm(len(data), device=self.device)
             for rows in order.chunk(ppo.minibatches):
                 losses = self.loss(data[rows])
@@ -135,14 +135,15 @@ class PPOTrainer:
                     skipped += 1
                     continue
                 self.optimizer.step()
-                kl = float(losses["kl_approx"])
-                if updates > 0:  # before the batch's first step the divergence is zero by construction
-                    self._adapt_learning_rate(kl)
+                epoch_kl.append(losses["kl_approx"].item())
                 updates += 1
                 for name in ("loss_objective", "loss_critic", "kl_approx", "clip_fraction"):
-                    sums[name] = sums.get(name, 0.0) + float(losses[name])
+                    sums[name] = sums.get(name, 0.0) + losses[name].item()
         if updates == 0:
             raise FloatingPointError("every gradient of this batch is non-finite; resume from the last checkpoint")
+        # Once per batch, by its last pass: the divergence adds up over a batch, so that adapting at each step drives the rate
+        # up at the batch's beginning and far down at its end.
+        self._adapt_learning_rate(sum(epoch_kl) / len(epoch_kl))
         means = {f"update/{name.removesuffix('_approx')}": value / updates for name, value in sums.items()}
         return means | {
             "update/learning_rate": self.learning_rate,
@@ -191,8 +192,12 @@ class PPOTrainer:
 
     def _initialize_normalizer(self) -> None:
         """Spend one batch on the observation statistics alone; it is not trained on and does not count."""
-        batch = next(self._batches)
+        batch = self._collect()
         self.networks.normalizer.module.update(*(batch[key] for key in self.networks.observations))
+
+    def _collect(self) -> TensorDictBase:
+        with one_thread_for_small_batches(self.config.num_envs, self.device):
+            return next(self._batches)
 
 
 class _StopRequest:
@@ -224,11 +229,13 @@ def train(config: TrainConfig) -> None:
         directory.save(checkpoint, trainer.samples, wall_seconds=trainer.wall_seconds, **best)
 
     checkpoint = trainer.checkpoint()
-    last_save = time.monotonic()
+    began = last_save = time.monotonic()
     with TrainingProgress(config.total_steps, trainer.samples) as progress:
         sim = trainer.env.sim
         progress.message(f"run {directory.path}: {config.num_envs} worlds, {sim.engine} engine, {trainer.device}")
         while trainer.samples < config.total_steps and not stop.requested:
+            if config.max_minutes and time.monotonic() - began > 60.0 * config.max_minutes:
+                break
             scalars = trainer.iterate()
             best = {"reward": scalars["rollout/reward"]}
             directory.log(scalars, trainer.samples)

@@ -58,7 +58,9 @@ class TrainingProgress:
 
     def update(self, samples: int, scalars: dict[str, float]) -> None:
         """Show the state after ``samples`` samples."""
-        self._bar.update(self._task, completed=samples, samples=f"{samples / 1e6:.2f} of {self._total / 1e6:g} M samples")
+        self._bar.update(
+            self._task, completed=samples, samples=f"{samples / 1e6:.2f} of {self._total / 1e6:g} M samples"
+        )
         now = time.monotonic()
         if self._live is not None:
             self._live.update(Group(self._bar, _table(scalars)))

@@ -42,7 +42,9 @@ class RunDirectory:
             self.path.mkdir(parents=True, exist_ok=True)
             (self.path / "config.json").write_text(json.dumps(dataclasses.asdict(config), indent=2) + "\n")
         except OSError as error:
-            raise InputError("--log-dir", str(self.path), f"cannot write there ({error.strerror}); choose another") from error
+            raise InputError(
+                "--log-dir", str(self.path), f"cannot write there ({error.strerror}); choose another"
+            ) from error
         (self.path / "git.txt").write_text(_git_state())
         self._rotation = rotation(self.path)
         self._loggers = [get_logger("tensorboard", logger_name=str(self.path), experiment_name="tensorboard")]

@@ -1,0 +1,97 @@
+"""Learning curves of a run as PNG and CSV: ``python -m quadhrl.eval.curves RUN [RUN ...] --out curves.png``."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import matplotlib
+import tyro
+
+from quadhrl.errors import InputError, command_line
+
+__all__ = ["CurvesConfig", "main", "plot_curves", "read_scalars"]
+
+PANELS = {
+    "rollout/reward": "reward per control step",
+    "rollout/pairs_per_second": "target pairs hit per second",
+    "rollout/falls_per_minute": "falls per robot-minute",
+    "curriculum/level": "mean terrain level",
+}
+
+
+@dataclass
+class CurvesConfig:
+    """Plot the learning curves of training runs."""
+
+    runs: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """Run directories."""
+    out: str = "curves.png"
+    """Picture to write; the numbers go into a CSV file beside it."""
+
+
+def read_scalars(run: str | Path) -> dict[str, list[tuple[int, float]]]:
+    """TensorBoard scalars of a run: (samples, value) by name.
+
+    Raises:
+        InputError: there are none.
+    """
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    merged: dict[str, dict[int, float]] = {}
+    for file in sorted(Path(run).rglob("events.out.tfevents.*")):  # one per start of the run; later ones win
+        events = EventAccumulator(str(file), size_guidance={"scalars": 0})
+        events.Reload()
+        for name in events.Tags()["scalars"]:
+            merged.setdefault(name, {}).update((event.step, event.value) for event in events.Scalars(name))
+    if not merged:
+        raise InputError("RUN", str(run), "no TensorBoard scalars there; give a run directory")
+    return {name: sorted(points.items()) for name, points in merged.items()}
+
+
+def plot_curves(runs: list[Path], out: Path) -> Path:
+    """Draw the runs' curves into ``out`` (PNG) and write them beside it as CSV; returns the CSV's path."""
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    scalars = {run.name: read_scalars(run) for run in runs}
+    figure, axes = plt.subplots(1, len(PANELS), figsize=(4.2 * len(PANELS), 3.4), constrained_layout=True)
+    for axis, (name, title) in zip(axes, PANELS.items(), strict=True):
+        for run, values in scalars.items():
+            points = values.get(name, [])
+            axis.plot([step / 1e6 for step, _ in points], [value for _, value in points], label=run, linewidth=1.2)
+        axis.set(title=title, xlabel="samples [M]")
+        axis.grid(alpha=0.3)
+    if len(runs) > 1:
+        axes[0].legend(frameon=False)
+    figure.savefig(out, dpi=130)
+    plt.close(figure)
+    table = out.with_suffix(".csv")
+    with table.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["run", "samples", *PANELS])
+        for run, values in scalars.items():
+            columns = {name: dict(values.get(name, [])) for name in PANELS}
+            for step, _ in values["rollout/reward"]:
+                writer.writerow([run, step, *(f"{columns[name].get(step, float('nan')):.5g}" for name in PANELS)])
+    return table
+
+
+def main() -> None:
+    """Command line of the plotter."""
+
+    def run() -> None:
+        config = tyro.cli(CurvesConfig, prog="python -m quadhrl.eval.curves")
+        out = Path(config.out)
+        if not out.absolute().parent.is_dir():
+            raise InputError("--out", config.out, "its folder does not exist; create it or choose another")
+        table = plot_curves([Path(name) for name in config.runs], out)
+        print(out.absolute(), table.absolute(), sep="\n")
+
+    command_line(run)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,67 @@
+"""Playing a policy headless."""
+
+import subprocess
+import sys
+
+import pytest
+
+from quadhrl.errors import InputError
+from quadhrl.eval.play import PlayConfig, play
+from quadhrl.trainers.config import parse_command_line
+from quadhrl.trainers.ppo import train
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("logs")
+    flags = ["--preset", "smoke", "--num-envs", "4", "--ppo.horizon", "4", "--total-steps", "16", "--run-name", "r"]
+    train(parse_command_line(args=[*flags, "--log-dir", str(folder)]))
+    return folder / "r"
+
+
+def test_film_and_picture_of_a_trained_policy(run, tmp_path):
+    config = PlayConfig(
+        str(run),
+        video=str(tmp_path / "a.mp4"),
+        picture=str(tmp_path / "a.png"),
+        seconds=0.5,
+        num_envs=2,
+        width=320,
+        height=240,
+    )
+    scalars = play(config)
+    assert "rollout/pairs_per_second" in scalars
+    imageio = pytest.importorskip("imageio.v3")
+    frames = imageio.imread(tmp_path / "a.mp4")
+    assert frames.shape == (15, 240, 320, 3)
+    assert frames.std(axis=(1, 2)).min() > 5, "pictures, not blank frames"
+    picture = imageio.imread(tmp_path / "a.png")
+    red = (picture[..., 0] > 150) & (picture[..., 1] < 110) & (picture[..., 2] < 80)
+    assert red.sum() > 20, "the next targets are drawn"
+
+
+@pytest.mark.parametrize("policy", ["zero", "random"])
+def test_dummy_policies_need_no_checkpoint(policy):
+    assert play(PlayConfig(policy=policy, seconds=0.2, num_envs=2))["rollout/faults_per_minute"] == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({}, "CHECKPOINT: got ''; give a checkpoint"),
+        ({"checkpoint": "nowhere.ckpt"}, "no such file"),
+        ({"policy": "magic"}, "--policy: got 'magic'"),
+        ({"policy": "zero", "video": "/nowhere/a.mp4"}, "--video: got '/nowhere/a.mp4'"),
+        ({"policy": "zero", "seconds": 0.0}, "--seconds: got 0.0"),
+        ({"policy": "zero", "infill": 2.0}, "--infill: got 2.0"),
+    ],
+)
+def test_bad_input_is_named(changes, message):
+    with pytest.raises(InputError, match=message):
+        play(PlayConfig(**changes))
+
+
+def test_command_line_refuses_to_play_nothing():
+    done = subprocess.run([sys.executable, "-m", "quadhrl.eval.play"], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2 and done.stderr.startswith("error: CHECKPOINT")
+    assert len(done.stderr.splitlines()) == 1
