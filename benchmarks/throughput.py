@@ -15,6 +15,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import quadhrl  # noqa: F401  (before torch: see there)  # isort: skip
 import torch
@@ -81,14 +82,18 @@ def measure(engine: str, config: BenchmarkConfig) -> dict[str, float]:
             td["action"] = action
             env.step(td)
 
+    def replay_targets(targets: list[torch.Tensor]) -> None:
+        for joint_targets in targets:
+            sim._advance(joint_targets)
+
     seconds = dict.fromkeys(("raw", "env_step", "collect", "train"), 0.0)
     for _ in range(config.repeats):
         state = copy.deepcopy(env.state_dict())
         actions, targets = _record(trainer, policy, config.horizon)
         env.load_state_dict(state)
-        seconds["env_step"] += timed(lambda: replay_actions(actions))
+        seconds["env_step"] += timed(partial(replay_actions, actions))
         env.load_state_dict(state)
-        seconds["raw"] += timed(lambda: [sim._advance(joint_targets) for joint_targets in targets])
+        seconds["raw"] += timed(partial(replay_targets, targets))
         env.load_state_dict(state)
         trainer.collector.reset(keep_state=True)
         seconds["collect"] += timed(trainer._collect)

@@ -84,7 +84,7 @@ def play(config: PlayConfig) -> dict[str, float]:
             setattr(env_config.terrain, name, getattr(config, name))
     env = FootstepEnv(env_config, config.num_envs, engine=config.engine, device=device, seed=config.seed)
 
-    def act(td):  # noqa: ANN001, ANN202
+    def act(td):
         if policy is not None:
             return policy(td)
         action = torch.zeros_like(env.action_spec.zero()) if config.policy == "zero" else env.action_spec.rand()

@@ -14,7 +14,7 @@ from quadhrl.sim.terrain import TerrainConfig
 __all__ = ["PhysicsConfig", "Scene", "build_scene"]
 
 WINDOW = 8
-"""Blocks along each side of the window that follows a robot: with 0.2 m blocks at least 0.65 m of ground on every side."""
+"""Blocks along each side of the window that follows a robot: with 0.2 m blocks some 0.65 m of ground on every side."""
 
 BLOCK_OVERLAP = 0.05
 """How far a block's box reaches under those neighbours that are at least as high [m]; see `Simulator`."""

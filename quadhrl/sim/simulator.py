@@ -16,6 +16,9 @@ from quadhrl.sim.terrain import BlockTerrain
 
 __all__ = ["Fault", "Readings", "Simulator"]
 
+FOLLOW_STEPS = 4
+"""Control steps between two looks at whether a robot has left the middle of its terrain window."""
+
 
 class Fault(IntFlag):
     """Why a world's last control step cannot be trusted."""
@@ -99,6 +102,7 @@ class Simulator(ABC):
         self._home = torch.tensor(scene.home, device=device)
         self._centre = torch.zeros(self.num_worlds, 2, dtype=torch.long, device=device)
         self._block_offset = torch.as_tensor(scene.block_offset, device=device)
+        self._steps = 0
         self._window = round(len(scene.blocks) ** 0.5)
         self.readings: Readings
         """The latest readings."""
@@ -145,7 +149,7 @@ class Simulator(ABC):
         self._write(worlds, qpos, qvel, ctrl=self._home[7:].expand(len(worlds), -1))
         self._forward(worlds)
         self.readings = self.readings.replace(**self._kinematics())
-        self._follow(worlds)
+        self._lay_around_robots(worlds)
         self._silence(worlds)
         return self.readings
 
@@ -156,6 +160,7 @@ class Simulator(ABC):
             "physics": self._state(),
             "readings": readings,
             "centre": self._centre,
+            "steps": self._steps,
             "fault": self.fault,
             "fault_counts": self.fault_counts,
             "terrain": {
@@ -171,6 +176,7 @@ class Simulator(ABC):
         self.readings = Readings(**{name: value.to(self.device) for name, value in state["readings"].items()})
         everyone = torch.arange(self.num_worlds, device=self.device)
         self._centre.copy_(state["centre"])
+        self._steps = int(state["steps"])
         self._lay(everyone)
         self._load_state(state["physics"])
         self._forward(everyone)
@@ -244,20 +250,24 @@ class Simulator(ABC):
             | torch.where(self._overflowed(), int(Fault.OVERFLOW), 0)
         )
 
-    def _follow(self, worlds: Tensor | None = None) -> None:
-        """Move the terrain window along with its robot.
+    def _follow(self) -> None:
+        """Move the terrain windows of the robots that have left theirs' middle."""
+        self._steps += 1
+        if self._steps % FOLLOW_STEPS:
+            return
+        # Half a block is enough to leave; the rest keeps a robot on an edge from moving its window again and again.
+        away = (self._in_blocks() - self._centre).abs().amax(-1) > 0.6
+        worlds = away.nonzero().squeeze(-1)
+        if len(worlds):
+            self._lay_around_robots(worlds)
 
-        Args:
-            worlds: worlds whose window is laid anew whatever their robot did; None for those whose robot left its block.
-        """
-        at = self.readings.base_position[:, :2] / self.terrain.config.block_size
-        if worlds is None:
-            # Half a block is enough to leave; the rest keeps a robot on an edge from moving its window at every step.
-            worlds = ((at - self._centre).abs() > 0.75).any(-1).nonzero().squeeze(-1)
-            if len(worlds) == 0:
-                return
-        self._centre[worlds] = torch.round(at[worlds]).long()
+    def _lay_around_robots(self, worlds: Tensor) -> None:
+        self._centre[worlds] = torch.round(self._in_blocks()[worlds]).long()
         self._lay(worlds)
+
+    def _in_blocks(self) -> Tensor:
+        """Horizontal position of each base in units of a block [N, 2]."""
+        return self.readings.base_position[:, :2] / self.terrain.config.block_size
 
     def _lay(self, worlds: Tensor) -> None:
         """Lay the windows of some worlds around their `_centre`."""

@@ -1,5 +1,8 @@
 """MuJoCo-Warp: all worlds in GPU kernels, one captured CUDA graph per control step; the same code runs on Warp's CPU."""
 
+# pyright: reportOperatorIssue=false, reportGeneralTypeIssues=false
+# (Warp compiles the kernels' arithmetic from the source; it is not Python's.)
+
 from __future__ import annotations
 
 import copy

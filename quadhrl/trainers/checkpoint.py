@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
-from quadhrl.errors import InputError
 from quadhrl.envs.scan import SCAN_POINTS
 from quadhrl.envs.trajectory_generator import ACTION_DIM
+from quadhrl.errors import InputError
 from quadhrl.policies import ActorCritic
 from quadhrl.trainers.config import TrainConfig, config_from_dict
 
@@ -87,7 +87,8 @@ def read_metadata(path: Path, field: str = "checkpoint") -> dict[str, Any]:
         raise InputError(field, str(path), "the file is damaged or no checkpoint; give another one") from error
     facts = manifest.get("metadata") or {}
     if facts.get("quadhrl_format") != FORMAT_VERSION:
-        remedy = f"its format is {facts.get('quadhrl_format')!r}, this version reads {FORMAT_VERSION}; use the version that wrote it"
+        found = facts.get("quadhrl_format")
+        remedy = f"its format is {found!r}, this version reads {FORMAT_VERSION}; use the version that wrote it"
         raise InputError(field, str(path), remedy)
     return facts
 

@@ -13,6 +13,17 @@ from rich.table import Table
 __all__ = ["TrainingProgress"]
 
 
+_LINE = {
+    "reward": "rollout/reward",
+    "pairs/s": "rollout/pairs_per_second",
+    "falls/min": "rollout/falls_per_minute",
+    "level": "curriculum/level",
+    "std": "policy/std",
+    "lr": "update/learning_rate",
+    "steps/s": "perf/steps_per_second",
+}
+
+
 class TrainingProgress:
     """Shows a live display on a terminal, and a line every `LINE_SECONDS` elsewhere.
 
@@ -68,11 +79,7 @@ class TrainingProgress:
             self._last_line = now
             rate = (samples - self._begun_at) / max(now - self._started, 1e-9)
             eta = (self._total - samples) / max(rate, 1e-9)
-            shown = {
-                "reward": "rollout/reward", "pairs/s": "rollout/pairs_per_second", "falls/min": "rollout/falls_per_minute",
-                "level": "curriculum/level", "std": "policy/std", "lr": "update/learning_rate", "steps/s": "perf/steps_per_second",
-            }  # fmt: skip
-            numbers = "  ".join(f"{short} {scalars[name]:.4g}" for short, name in shown.items() if name in scalars)
+            numbers = "  ".join(f"{short} {scalars[name]:.4g}" for short, name in _LINE.items() if name in scalars)
             self.message(f"{samples / 1e6:7.2f} M  {numbers}  ETA {eta / 60:.1f} min")
 
 

@@ -60,7 +60,7 @@ class RunDirectory:
 
     def log(self, scalars: dict[str, float], step: int) -> None:
         """Write scalars at ``step`` samples."""
-        for target in self._loggers:
+        for target in filter(None, self._loggers):
             for name, value in scalars.items():
                 target.log_scalar(name, value, step=step)
 

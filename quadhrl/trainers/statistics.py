@@ -32,7 +32,7 @@ def rollout_statistics(batch: TensorDictBase, control_dt: float) -> dict[str, fl
     }
     if len(lengths):
         scalars["rollout/episode_length"] = lengths.mean().item()
-    if "pair_hit" in events.keys():
+    if events.get("pair_hit", None) is not None:
         scalars["rollout/pairs_per_second"] = events["pair_hit"].sum().item() / seconds
         scalars["rollout/stuck_per_minute"] = events["stuck"].sum().item() * per_minute
     for name, term in after["reward_terms"].items():

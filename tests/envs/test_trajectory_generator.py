@@ -71,7 +71,7 @@ def test_feet_stay_level_when_the_base_tilts(generator, robot):
         r, p = float(roll[world]), float(pitch[world])
         rx = np.array([[1, 0, 0], [0, math.cos(r), -math.sin(r)], [0, math.sin(r), math.cos(r)]])
         ry = np.array([[math.cos(p), 0, math.sin(p)], [0, 1, 0], [-math.sin(p), 0, math.cos(p)]])
-        assert (ry @ rx @ tilted[world].numpy().T).T == pytest.approx(flat[world].numpy(), abs=1e-4)
+        assert pytest.approx(flat[world].numpy(), abs=1e-4) == (ry @ rx @ tilted[world].numpy().T).T
 
 
 def test_swing_window_and_support_follow_the_paper(generator):

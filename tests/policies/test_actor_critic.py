@@ -54,5 +54,5 @@ def test_value_is_in_reward_units_and_differentiable_in_the_goal():
 
 
 def test_bad_settings_are_named():
-    with pytest.raises(InputError, match="--network.hidden-size: got 0"):
+    with pytest.raises(InputError, match=r"--network\.hidden-size: got 0"):
         ActorCritic(SIZES, 15, NetworkConfig(hidden_size=0))

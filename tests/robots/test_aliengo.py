@@ -116,7 +116,7 @@ def test_unknown_robot_names_the_choices():
 def test_a_config_that_does_not_fit_its_mjcf_is_refused(robot, tmp_path):
     with pytest.raises(InputError, match="joints: got 'nose'"):
         dataclasses.replace(robot, joints=("nose", *robot.joints[1:])).spec()
-    with pytest.raises(InputError, match="mjcf.*existing"):
+    with pytest.raises(InputError, match=r"mjcf.*existing"):
         dataclasses.replace(robot, mjcf=tmp_path / "missing.xml").spec()
     broken = tmp_path / "broken.xml"
     broken.write_text("<mujoco><worldbody>")

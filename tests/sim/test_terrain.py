@@ -82,56 +82,69 @@ def test_blocks_in_the_engine_are_where_heights_says(make_sim, engine, infill, h
     sim.reset(torch.arange(3), qpos)
     rng = np.random.default_rng(1)
     for world in range(3):
-        model, data = geoms_of(sim, world)
-        points = away[world].numpy() + rng.uniform(-0.65, 0.65, size=(40, 2))
-        points = points[
-            (np.abs((points / 0.2) % 1 - 0.5) < 0.36).all(1)
-        ]  # a sphere beside an edge would touch two blocks
+        points = away[world].numpy() + rng.uniform(-0.6, 0.6, size=(40, 2))
+        inside = (np.abs((points / 0.2) % 1 - 0.5) < 0.36).all(1)  # a sphere beside an edge would touch two blocks
+        points = points[inside]
         heights = sim.terrain.heights(torch.tensor(points, dtype=torch.float32)[None], torch.tensor([world]))[0].numpy()
+        model, data = boxes_and_balls(sim, world, points, heights + 0.05)
+        only_boxes = np.array([1, 0, 0, 0, 0, 0], np.uint8)
         for (x, y), height in zip(points, heights, strict=True):
-            geom = np.zeros(1, np.int32)
-            distance = mujoco.mj_ray(model, data, [x, y, 1.0], [0.0, 0.0, -1.0], None, 1, -1, geom)
-            assert geom[0] in sim.scene.blocks
+            distance = mujoco.mj_ray(
+                model, data, [x, y, 1.0], [0.0, 0.0, -1.0], only_boxes, 1, -1, np.zeros(1, np.int32)
+            )
             assert 1.0 - distance == pytest.approx(height, abs=1e-5)
-        dropped = drop_spheres(model, points, heights)
-        assert dropped == pytest.approx(heights + 0.0265, abs=2e-3)
+        for _ in range(300):
+            mujoco.mj_step(model, data)
+        resting = data.geom_xpos[-len(points) :, 2]
+        assert resting == pytest.approx(heights + 0.0265, abs=2e-3)
 
 
-def geoms_of(sim, world):
-    """A plain MuJoCo model without the robot, its boxes where the engine has them in that world."""
-    spec = mujoco.MjSpec()
-    for k in range(len(sim.scene.blocks)):
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.1, 1.0], name=f"block_{k}")
-    model = spec.compile()
+def boxes_and_balls(sim, world, points, heights):
+    """A plain MuJoCo model of the engine's boxes in that world, and foot-sized balls above the points."""
     if sim.engine == "native":
-        position = sim.batch.get_model(world).geom_pos[sim.scene.blocks]
+        model = sim.batch.get_model(world)
+        positions, sizes = model.geom_pos[sim.scene.blocks], model.geom_size[sim.scene.blocks]
     else:
-        position = sim._view["geom_xpos"][world][sim._blocks].numpy()
-    model.geom_pos[:] = position
+        positions, sizes = (sim._view[name][world][sim._blocks].double().numpy() for name in ("geom_xpos", "geom_size"))
+    spec = mujoco.MjSpec()
+    for position, size in zip(positions, sizes, strict=True):
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=position, contype=1, conaffinity=2)
+    for (x, y), height in zip(points, heights, strict=True):
+        ball = spec.worldbody.add_body(pos=[x, y, height])
+        ball.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
+        ball.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.0265, 0, 0], mass=0.1, group=1, contype=2, conaffinity=1
+        )  # fmt: skip
+    model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    sim.scene.blocks.sort()
-    data_ids = {"offset": sim.scene.blocks[0]}
-    assert data_ids["offset"] == 0, "the blocks are the model's first geoms, so the ids agree"
     return model, data
 
 
-def drop_spheres(model, points, heights):
-    """Height at which a foot-sized sphere comes to rest on the boxes, one drop per point."""
-    rest = []
+def test_boxes_never_show_beyond_their_block(make_sim):
+    """The overlap that closes the seams must be hidden: rays close to every edge, on steps and gaps."""
+    sim = make_sim(1, infill=0.7, height_range=0.1, seed=5)
+    model, data = boxes_and_balls(sim, 0, np.zeros((0, 2)), np.zeros(0))
+    edges = np.arange(-6, 7) * 0.1 + np.repeat([[-0.004], [0.004]], 13, 1)
+    points = np.array([[x, y] for x in edges.ravel() for y in edges.ravel()])
+    heights = sim.terrain.heights(torch.tensor(points, dtype=torch.float32)[None])[0].numpy()
+    assert (heights == -2).any() and len(np.unique(heights)) > 20
     for (x, y), height in zip(points, heights, strict=True):
-        spec = mujoco.MjSpec()
-        for position in model.geom_pos[np.linalg.norm(model.geom_pos[:, :2] - [x, y], axis=1) < 0.3]:
-            spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.1, 1.0], pos=position)
-        ball = spec.worldbody.add_body(pos=[x, y, height + 0.03])
-        ball.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
-        ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.0265, 0, 0], mass=0.1)
-        dropped = spec.compile()
-        data = mujoco.MjData(dropped)
-        for _ in range(300):
-            mujoco.mj_step(dropped, data)
-        rest.append(data.geom_xpos[-1, 2])
-    return np.array(rest)
+        distance = mujoco.mj_ray(model, data, [x, y, 1.0], [0.0, 0.0, -1.0], None, 1, -1, np.zeros(1, np.int32))
+        assert 1.0 - distance == pytest.approx(height, abs=1e-5), (x, y)
+
+
+@pytest.mark.parametrize("engine", ["native", "warp"])
+def test_feet_do_not_sink_into_the_seams_of_level_ground(make_sim, engine):
+    """A robot stamping on the corner of four blocks; before the overlap, a fifth of such feet sat 10 cm deep."""
+    sim = make_sim(16, engine=engine)
+    stance = sim._home[7:].float().expand(16, -1)
+    generator = torch.Generator().manual_seed(0)
+    lowest = min(
+        sim.step(stance + 0.2 * torch.randn(16, 12, generator=generator)).foot_position[..., 2].min().item()
+        for _ in range(120)
+    )
+    assert lowest > -0.03
 
 
 @pytest.mark.parametrize(
