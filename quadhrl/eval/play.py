@@ -12,6 +12,7 @@ import tyro
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from quadhrl.envs import FootstepConfig, FootstepEnv
+from quadhrl.envs.footstep import FootstepTerminationConfig
 from quadhrl.errors import InputError, command_line
 from quadhrl.sim import resolve_device
 from quadhrl.trainers.checkpoint import load_networks
@@ -79,6 +80,7 @@ def play(config: PlayConfig) -> dict[str, float]:
     else:
         env_config, policy = FootstepConfig(), None
     env_config.curriculum.enabled = False
+    env_config.termination = FootstepTerminationConfig()  # the paper's, whatever training used
     for name in ("infill", "height_range"):
         if getattr(config, name) is not None:
             setattr(env_config.terrain, name, getattr(config, name))

@@ -23,9 +23,11 @@ class NetworkConfig:
     """Units in each hidden layer."""
     hidden_layers: int = 2
     """Number of hidden layers."""
+    goal_gain: float = 2.0
+    """Factor on the normalised goal, which is 12 of 376 inputs and decides where the feet must go."""
     scan_gain: float = 0.12
-    """Factor on the normalised terrain scan. On level ground a foot's 71 scan entries are 71 copies of its height; a factor of
-    1/sqrt(71) gives them together the weight of one input."""
+    """Factor on the normalised terrain scan. On level ground a foot's 71 scan entries are 71 copies of its height; a
+    factor of 1/sqrt(71) gives them together the weight of one input."""
     initial_std: float = 0.5
     """Initial standard deviation of every action."""
     initial_amplitude: float = -0.7
@@ -45,10 +47,10 @@ class NetworkConfig:
             if getattr(self, field) < 1:
                 flag = f"--network.{field.replace('_', '-')}"
                 raise InputError(flag, getattr(self, field), "give a whole number of at least 1")
-        if self.scan_gain <= 0.0:
-            raise InputError("--network.scan-gain", self.scan_gain, "give a number above 0")
-        if self.initial_std <= 0.0:
-            raise InputError("--network.initial-std", self.initial_std, "give a number above 0")
+        for field in ("goal_gain", "scan_gain", "initial_std"):
+            if getattr(self, field) <= 0.0:
+                flag = f"--network.{field.replace('_', '-')}"
+                raise InputError(flag, getattr(self, field), "give a number above 0")
 
 
 class _Gaussian(nn.Module):
@@ -95,7 +97,8 @@ class ActorCritic(nn.Module):
         config.validate()
         self.observations = dict(observations)
         features = sum(observations.values())
-        gains = [config.scan_gain if name == "scan" else 1.0 for name in observations]
+        gain = {"goal": config.goal_gain, "scan": config.scan_gain}
+        gains = [gain.get(name, 1.0) for name in observations]
         self.normalizer = TensorDictModule(
             ObservationNormalizer(list(observations.values()), gains), in_keys=list(observations), out_keys=["features"]
         )

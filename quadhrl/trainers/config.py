@@ -141,7 +141,7 @@ def _cpu() -> TrainConfig:
     config.ppo = PPOConfig(horizon=24, epochs=3, minibatches=4, target_kl=0.015)
     config.network.initial_std = 0.25
     config.env.termination.max_steps = 1200
-    config.env.termination.stuck_seconds = 2.0
+    config.env.termination.stuck_seconds = 1.0
     config.env.termination.fall_height = 0.12
     config.env.termination.max_tilt = 60.0
     config.env.curriculum.enabled = True
