@@ -1,4 +1,4 @@
-"""Watch a policy: ``python -m quadhrl.eval.play CHECKPOINT --video out.mp4`` (headless)."""
+"""Watch a policy: ``python -m quadhrl.eval.play CHECKPOINT --video out.mp4`` (headless), or ``--viewer`` in a browser."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Annotated
 
 import torch
 import tyro
+from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from quadhrl.envs import FootstepConfig, FootstepEnv
@@ -33,6 +34,8 @@ class PlayConfig:
     """Write a film of the first world to this file (.mp4)."""
     picture: str = ""
     """Write the last frame to this file (.png)."""
+    viewer: bool = False
+    """Show the first world in a browser as it runs, in real time."""
     seconds: float = 15.0
     """Simulated time [s]."""
     infill: float | None = None
@@ -92,18 +95,30 @@ def play(config: PlayConfig) -> dict[str, float]:
         action = torch.zeros_like(env.action_spec.zero()) if config.policy == "zero" else env.action_spec.rand()
         return td.set("action", action)
 
-    film = _Film(config, env) if config.video or config.picture else None
+    watchers = []
+    if config.video or config.picture:
+        watchers.append(_Film(config, env))
+    if config.viewer:
+        from quadhrl.eval.viewer import WebViewer
+
+        watchers.append(WebViewer(env))
+        print(watchers[-1].url)
+
+    def watch(_env: FootstepEnv, _td: TensorDictBase) -> None:
+        for watcher in watchers:
+            watcher.show()
+
     steps = round(config.seconds / env_config.physics.control_dt)
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         rollout = env.rollout(
             steps,
             policy=act,
             break_when_any_done=False,
-            callback=None if film is None else lambda env, td: film.shoot(),
+            callback=watch if watchers else None,
             auto_cast_to_device=False,
         )
-    if film is not None:
-        film.close()
+    for watcher in watchers:
+        watcher.close()
     return rollout_statistics(rollout, env_config.physics.control_dt)
 
 
@@ -124,7 +139,7 @@ class _Film:
                 remedy = f"cannot write it ({error}); install quadhrl[video] and choose a writable .mp4 file"
                 raise InputError("--video", config.video, remedy) from error
 
-    def shoot(self) -> None:
+    def show(self) -> None:
         if self._writer is not None and self._steps % FRAME_STEPS == 0:
             self._writer.append_data(self._renderer.frame())
         self._steps += 1

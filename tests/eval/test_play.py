@@ -65,3 +65,26 @@ def test_command_line_refuses_to_play_nothing():
     done = subprocess.run([sys.executable, "-m", "quadhrl.eval.play"], capture_output=True, text=True, timeout=120)
     assert done.returncode == 2 and done.stderr.startswith("error: CHECKPOINT")
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_web_viewer_serves_a_page_while_the_policy_plays():
+    pytest.importorskip("viser")
+    import urllib.request
+
+    from quadhrl.envs import FootstepConfig, FootstepEnv
+    from quadhrl.eval.viewer import WebViewer
+
+    env = FootstepEnv(FootstepConfig(), 2)
+    td = env.reset()
+    viewer = WebViewer(env, port=18080)
+    try:
+        for _ in range(5):
+            td["action"] = env.action_spec.rand()
+            td = env.step(td)["next"]
+            viewer.show()
+        page = urllib.request.urlopen(viewer.url, timeout=10).read()
+        foot = viewer._shapes[int(viewer.view.scene.feet[0])]
+        assert foot.position == pytest.approx(env.sim.readings.foot_position[0, 0].numpy(), abs=1e-4)
+    finally:
+        viewer.close()
+    assert b"<html" in page.lower()

@@ -1,0 +1,30 @@
+"""The exported policy against PyTorch's, in another runtime."""
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from quadhrl.eval.export import export_onnx
+from quadhrl.policies import ActorCritic
+
+
+def test_onnx_policy_gives_the_same_actions(tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    networks = ActorCritic({"proprioception": 80, "goal": 12, "scan": 284}, 15)
+    observations = [torch.randn(7, size) * 3 for size in (80, 12, 284)]
+    networks.normalizer.module.update(*observations)
+    export_onnx(networks, tmp_path / "policy.onnx")
+    assert [path.name for path in tmp_path.iterdir()] == ["policy.onnx"], "one file, no external data"
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
+    inputs = {name: x.numpy() for name, x in zip(networks.observations, observations, strict=True)}
+    (action,) = session.run(["action"], inputs)
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        expected = networks.policy()(dict_to_td(networks, observations))["action"].clamp(-1, 1)
+    assert np.allclose(action, expected.numpy(), atol=1e-5)
+
+
+def dict_to_td(networks, observations):
+    from tensordict import TensorDict
+
+    return TensorDict(dict(zip(networks.observations, observations, strict=True)), [len(observations[0])])
