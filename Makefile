@@ -29,7 +29,7 @@ format: .venv/ready
 	$(BIN)/ruff format .
 
 type: .venv/ready
-	$(BIN)/pyright
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
 bench: .venv/ready
 	$(BIN)/python benchmarks/throughput.py
