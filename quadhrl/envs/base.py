@@ -175,6 +175,7 @@ class LocomotionEnv(EnvBase):
 
     def _make_specs(self) -> None:
         n, device = self.num_envs, self.device
+        self._terminal_columns = [self.event_names.index(name) for name in self.terminal_events]
         flag = Binary(n=1, shape=(n, 1), dtype=torch.bool, device=device)
         unbounded = Unbounded(shape=(n, 1), device=device)
         events = {name: flag.clone() for name in self.event_names}
@@ -249,23 +250,24 @@ class LocomotionEnv(EnvBase):
         self.step_count += 1
         self._attitude = roll_pitch_yaw(now.base_quaternion)
 
-        trusted = self.sim.fault == 0  # a faulty world was put back to its home: its reward would be nonsense
-        terms = {
-            name: torch.where(trusted, term, 0.0) for name, term in self._reward_terms(before, now, action).items()
-        }
+        terms = self._reward_terms(before, now, action)
         self._previous_action = torch.stack([action, self._previous_action[:, 0]], 1)
+        # A faulty world was put back to its home: its reward would be nonsense.
+        trusted = (self.sim.fault == 0)[:, None]
+        rewarded = torch.where(trusted, torch.stack([terms[name] for name in self.reward_names], -1), 0.0)
         events = self._shared_events(now) | self._task_events()
-        terminated = torch.stack([events[name] for name in self.terminal_events]).any(0)
-        truncated = (events["timeout"] | events["success"]) & ~terminated
+        happened = torch.stack([events[name] for name in self.event_names], -1)
+        terminated = happened[:, self._terminal_columns].any(-1, keepdim=True)
+        truncated = (events["timeout"] | events["success"])[:, None] & ~terminated
 
         everyone = torch.arange(self.num_envs, device=self.device)
-        observation = TensorDict(self._observe(everyone), batch_size=self.batch_size, device=self.device)
-        observation["reward_terms"] = TensorDict({name: term[:, None] for name, term in terms.items()}, self.batch_size)
-        columns = {name: event[:, None] for name, event in events.items()}
-        observation["events"] = TensorDict(columns | {"step_count": self.step_count[:, None].clone()}, self.batch_size)
-        self._observation = observation
-        out = self._with_done(observation.clone(recurse=False), terminated[:, None], truncated[:, None])
-        out["reward"] = torch.stack(list(terms.values())).sum(0)[:, None]
+        observation: dict[str, Any] = self._observe(everyone)
+        observation["reward_terms"] = dict(zip(self.reward_names, rewarded.split(1, -1), strict=True))
+        observation["events"] = dict(zip(self.event_names, happened.split(1, -1), strict=True))
+        observation["events"]["step_count"] = self.step_count[:, None].clone()
+        self._observation = TensorDict(observation, self.batch_size, device=self.device)
+        out = self._with_done(self._observation.clone(recurse=False), terminated, truncated)
+        out["reward"] = rewarded.sum(-1, keepdim=True)
         return out
 
     def _with_done(

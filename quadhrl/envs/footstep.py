@@ -118,12 +118,11 @@ class FootstepEnv(LocomotionEnv):
         closeness = rewards.target_closeness(distance, hit, weights.hit_radius)
         velocity = rewards.velocity_towards_target(to_target, now.foot_velocity[..., :2], active)
         shared = self._shared_reward_terms(weights, before, now, action)
-        terms = {
+        return {
             "footstep_target": weights.footstep_target * rewards.footstep_target(closeness, hit, active),
             "velocity_towards_target": weights.velocity_towards_target * velocity,
             "foot_stay": weights.foot_stay * rewards.foot_stay(closeness, active),
         } | shared
-        return {name: terms[name] for name in self.reward_names}
 
     def _task_events(self) -> dict[str, Tensor]:
         """Advance the targets where a pair was hit (after the reward, before the observation) and say what happened."""

@@ -39,8 +39,5 @@ def scan(terrain: BlockTerrain, feet: Tensor, pattern: Tensor, clip: float, worl
         [K, 284], m, foot by foot.
     """
     x, y, z = (feet[..., k, None] for k in range(3))
-    xy = torch.stack(
-        [x + pattern[:, 0], y + pattern[:, 1]]
-    )  # coordinates outermost: both passes over them are contiguous
-    heights = terrain.heights(xy.movedim(0, -1), worlds)
+    heights = terrain.heights_at(x + pattern[:, 0], y + pattern[:, 1], worlds)
     return heights.neg_().add_(z).clamp_(-clip, clip).flatten(1)

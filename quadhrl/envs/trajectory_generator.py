@@ -127,8 +127,8 @@ def lift(p: Tensor) -> Tensor:
 
 def _level_to_base(feet: Tensor, attitude: RollPitchYaw) -> Tensor:
     """Rotate vectors [N, 4, 3] from the level, yaw-aligned frame into the base's: by -pitch about y, then -roll about x."""
-    cp, sp = torch.cos(attitude.pitch)[:, None], torch.sin(attitude.pitch)[:, None]
-    cr, sr = torch.cos(attitude.roll)[:, None], torch.sin(attitude.roll)[:, None]
+    angles = torch.stack([attitude.roll, attitude.pitch])[..., None]
+    (cr, cp), (sr, sp) = torch.cos(angles), torch.sin(angles)
     x, y, z = feet.unbind(-1)
     x, z = cp * x - sp * z, sp * x + cp * z
     return torch.stack([x, cr * y + sr * z, cr * z - sr * y], -1)

@@ -77,15 +77,10 @@ class NativeSimulator(Simulator):
         self.batch.forward(worlds.numpy(), stage=int(mujoco.mjtStage.mjSTAGE_VEL))
 
     def _kinematics(self) -> dict[str, Tensor]:
-        qpos, qvel = self.qpos.float(), self.qvel.float()
         feet = torch.from_numpy(self._sensors[:, :24].astype(np.float32)).view(-1, 2, 4, 3)
         return {
-            "base_position": qpos[:, :3],
-            "base_quaternion": qpos[:, 3:7],
-            "base_velocity": qvel[:, :3],
-            "base_angular_velocity": qvel[:, 3:6],
-            "joint_position": qpos[:, 7:],
-            "joint_velocity": qvel[:, 6:],
+            "qpos": self.qpos.float(),
+            "qvel": self.qvel.float(),
             "foot_position": feet[:, 0],
             "foot_velocity": feet[:, 1],
         }

@@ -122,6 +122,9 @@ def build_scene(
         raise InputError(f"robot {robot.name}: mjcf", str(robot.mjcf), "name every colliding geom in the MJCF")
     _add_sensors(spec, robot, link_geoms)
     model = spec.compile()
+    if [model.joint(k).name for k in range(1, model.njnt)] != list(robot.joints) or model.nq != 19:
+        remedy = "it must have a free joint and then just these joints, in this order; sort them"
+        raise InputError(f"robot {robot.name}: joints", list(robot.joints), remedy)
     links = model.geom_bodyid[[model.geom(name).id for name in link_geoms]]
     offsets = (
         np.stack(np.meshgrid(np.arange(window), np.arange(window), indexing="ij"), -1).reshape(-1, 2) - window // 2

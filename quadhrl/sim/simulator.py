@@ -38,18 +38,10 @@ class Readings:
     Positions and velocities are those at the end of the step; forces and torques acted during its last physics step.
     """
 
-    base_position: Tensor
-    """[N, 3], m."""
-    base_quaternion: Tensor
-    """[N, 4], wxyz."""
-    base_velocity: Tensor
-    """Linear velocity of the base's origin [N, 3], m/s."""
-    base_angular_velocity: Tensor
-    """[N, 3], rad/s, in the base's frame."""
-    joint_position: Tensor
-    """[N, 12], rad."""
-    joint_velocity: Tensor
-    """[N, 12], rad/s."""
+    qpos: Tensor
+    """Generalised positions [N, 19]: base position, base quaternion, joints."""
+    qvel: Tensor
+    """Generalised velocities [N, 18]: base linear (world) and angular (base's frame), joints."""
     joint_torque: Tensor
     """Servo torques [N, 12], N m."""
     foot_position: Tensor
@@ -60,6 +52,36 @@ class Readings:
     """Net contact force on each foot [N, 4, 3], N."""
     collisions: Tensor
     """Number of links, feet not counted, that touch the terrain or another link [N], int64."""
+
+    @property
+    def base_position(self) -> Tensor:
+        """[N, 3], m."""
+        return self.qpos[:, :3]
+
+    @property
+    def base_quaternion(self) -> Tensor:
+        """[N, 4], wxyz."""
+        return self.qpos[:, 3:7]
+
+    @property
+    def joint_position(self) -> Tensor:
+        """[N, 12], rad."""
+        return self.qpos[:, 7:]
+
+    @property
+    def base_velocity(self) -> Tensor:
+        """Linear velocity of the base's origin [N, 3], m/s."""
+        return self.qvel[:, :3]
+
+    @property
+    def base_angular_velocity(self) -> Tensor:
+        """[N, 3], rad/s, in the base's frame."""
+        return self.qvel[:, 3:6]
+
+    @property
+    def joint_velocity(self) -> Tensor:
+        """[N, 12], rad/s."""
+        return self.qvel[:, 6:]
 
     def __getitem__(self, worlds: Tensor) -> Readings:
         """The readings of some worlds."""
@@ -238,12 +260,10 @@ class Simulator(ABC):
                 self.readings = self.readings.replace(**{name: forces})
 
     def _find_faults(self) -> Tensor:
-        now = self.readings
-        velocity = torch.cat([now.base_angular_velocity, now.joint_velocity], -1)
+        qpos, qvel = self.readings.qpos, self.readings.qvel
         # A sum keeps every NaN and infinity. Float32 turns what is too large for it into infinity.
-        total = torch.cat([now.base_position, now.base_quaternion, now.joint_position, now.base_velocity, velocity], -1)
-        finite = torch.isfinite(total.sum(-1))
-        runaway = (now.base_velocity.norm(dim=-1) > 20.0) | (velocity.abs().amax(-1) > 200.0)
+        finite = torch.isfinite(qpos.sum(-1) + qvel.sum(-1))
+        runaway = (qvel[:, :3].norm(dim=-1) > 20.0) | (qvel[:, 3:].abs().amax(-1) > 200.0)
         return (
             torch.where(finite, 0, int(Fault.NONFINITE))
             | torch.where(finite & runaway, int(Fault.RUNAWAY), 0)

@@ -113,9 +113,13 @@ class BlockTerrain:
         Returns:
             Height of the block top, or ``-gap_depth`` over a gap [m], [K, ...].
         """
-        inverse = 1.0 / self.config.block_size
         x, y = xy.unbind(-1)
-        return self._look_up((x * inverse).floor_().int(), (y * inverse).floor_().int(), worlds)
+        return self.heights_at(x.clone(), y.clone(), worlds)
+
+    def heights_at(self, x: Tensor, y: Tensor, worlds: Tensor | None = None) -> Tensor:
+        """The same from separate coordinates [K, ...], which are overwritten: the scan's 145,000 points count every pass."""
+        inverse = 1.0 / self.config.block_size
+        return self._look_up(x.mul_(inverse).floor_().int(), y.mul_(inverse).floor_().int(), worlds)
 
     def block_heights(self, blocks: Tensor, worlds: Tensor | None = None) -> Tensor:
         """Height of blocks given by their integer indices.

@@ -213,17 +213,7 @@ class WarpSimulator(Simulator):
             self._kinematics_kernels()
 
     def _kinematics(self) -> dict[str, Tensor]:
-        qpos, qvel = self.qpos.clone(), self.qvel.clone()
-        return {
-            "base_position": qpos[:, :3],
-            "base_quaternion": qpos[:, 3:7],
-            "base_velocity": qvel[:, :3],
-            "base_angular_velocity": qvel[:, 3:6],
-            "joint_position": qpos[:, 7:],
-            "joint_velocity": qvel[:, 6:],
-            "foot_position": self._view["foot_position"].clone(),
-            "foot_velocity": self._view["foot_velocity"].clone(),
-        }
+        return {name: self._view[name].clone() for name in ("qpos", "qvel", "foot_position", "foot_velocity")}
 
     def _forces(self) -> dict[str, Tensor]:
         return {
