@@ -18,7 +18,7 @@ from quadhrl.envs.kinematics import RollPitchYaw, roll_pitch_yaw, rotate_yaw
 from quadhrl.envs.scan import SCAN_POINTS, scan, scan_pattern
 from quadhrl.envs.threads import one_thread_for_small_batches
 from quadhrl.envs.trajectory_generator import ACTION_DIM, TrajectoryGenerator, TrajectoryGeneratorConfig
-from quadhrl.errors import InputError
+from quadhrl.errors import check_range
 from quadhrl.robots import get_robot
 from quadhrl.sim import PhysicsConfig, Readings, TerrainConfig, make_simulator
 
@@ -60,12 +60,9 @@ class TerminationConfig:
         Raises:
             InputError: a field is out of its range.
         """
-        if self.max_steps < 1:
-            raise InputError("--termination.max-steps", self.max_steps, "give a whole number of at least 1")
-        if not 0.0 < self.max_tilt <= 180.0:
-            raise InputError("--termination.max-tilt", self.max_tilt, "give an angle between 0 and 180 degrees")
-        if self.goal_distance <= 0.0:
-            raise InputError("--termination.goal-distance", self.goal_distance, "give a distance above 0 m")
+        check_range(self, "termination", "max_steps", 1)
+        check_range(self, "termination", "max_tilt", 0, 180, "degrees", above=True)
+        check_range(self, "termination", "goal_distance", 0, unit="m", above=True)
 
 
 @dataclass
@@ -112,6 +109,7 @@ class LocomotionEnv(EnvBase):
         seed: int = 0,
     ) -> None:
         config.termination.validate()
+        check_range(config, "", "scan_clip", 0, unit="m", above=True)
         robot = get_robot(config.robot)
         self.sim = make_simulator(
             robot, config.terrain, config.physics, num_envs, engine=engine, device=device, seed=seed

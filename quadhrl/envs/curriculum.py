@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from quadhrl.errors import InputError
+from quadhrl.errors import check_range
 from quadhrl.sim import BlockTerrain
 
 __all__ = ["CurriculumConfig", "TerrainCurriculum"]
@@ -32,10 +32,9 @@ class CurriculumConfig:
         Raises:
             InputError: a field is out of its range.
         """
-        if not 0.0 <= self.demote <= self.promote:
-            raise InputError("--curriculum.demote", self.demote, "give a score between 0 and --curriculum.promote")
-        if self.levels < 1:
-            raise InputError("--curriculum.levels", self.levels, "give a whole number of at least 1")
+        check_range(self, "curriculum", "promote", 0, 1)
+        check_range(self, "curriculum", "demote", 0, self.promote)
+        check_range(self, "curriculum", "levels", 1)
 
 
 class TerrainCurriculum:

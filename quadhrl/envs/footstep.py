@@ -13,7 +13,7 @@ from quadhrl.envs import rewards
 from quadhrl.envs.base import LocomotionConfig, LocomotionEnv, SharedRewardConfig, TerminationConfig
 from quadhrl.envs.kinematics import rotate_yaw
 from quadhrl.envs.targets import FootstepTargets, TargetConfig
-from quadhrl.errors import InputError
+from quadhrl.errors import check_range
 from quadhrl.sim import Readings
 
 __all__ = ["FootstepConfig", "FootstepEnv", "FootstepRewardConfig", "FootstepTerminationConfig"]
@@ -34,6 +34,15 @@ class FootstepRewardConfig(SharedRewardConfig):
     hit_force: float = 5.0
     """Least vertical contact force of a hit [N]."""
 
+    def validate(self) -> None:
+        """Check the fields that are no coefficients.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        check_range(self, "rewards", "hit_radius slip_distance", 0, 1, "m", above=True)
+        check_range(self, "rewards", "hit_force", 0, unit="N")
+
 
 @dataclass
 class FootstepTerminationConfig(TerminationConfig):
@@ -49,8 +58,7 @@ class FootstepTerminationConfig(TerminationConfig):
             InputError: a field is out of its range.
         """
         super().validate()
-        if self.stuck_seconds <= 0.0:
-            raise InputError("--termination.stuck-seconds", self.stuck_seconds, "give a duration above 0 s")
+        check_range(self, "termination", "stuck_seconds", 0, unit="s", above=True)
 
 
 @dataclass
@@ -85,6 +93,7 @@ class FootstepEnv(LocomotionEnv):
     event_names = (*LocomotionEnv.event_names, "stuck", "pair_hit")
 
     def _set_up_task(self) -> None:
+        self.config.rewards.validate()
         self.targets = FootstepTargets(self.config.targets, self.nominal_feet, self.num_envs, self.rng)
         self.steps_since_hit = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         """Control steps since the last pair was hit, or since the episode began [N]."""

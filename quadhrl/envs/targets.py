@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from quadhrl.errors import InputError
+from quadhrl.errors import check_range
 
 __all__ = ["FootstepTargets", "TargetConfig"]
 
@@ -37,14 +37,11 @@ class TargetConfig:
         Raises:
             InputError: a field is out of its range.
         """
-        for field, low, high in (("max_step", 0.0, 1.0), ("max_heading", 0.0, 180.0), ("max_shift", 0.0, 0.5)):
-            if not low <= getattr(self, field) <= high:
-                flag = f"--targets.{field.replace('_', '-')}"
-                raise InputError(flag, getattr(self, field), f"give a value between {low} and {high}")
-        if self.ramp_pairs < 1:
-            raise InputError("--targets.ramp-pairs", self.ramp_pairs, "give a whole number of at least 1")
-        if not 0.0 < self.lateral_ratio <= 1.0:
-            raise InputError("--targets.lateral-ratio", self.lateral_ratio, "give a ratio above 0 and at most 1")
+        check_range(self, "targets", "max_step", 0, 1, "m")
+        check_range(self, "targets", "max_heading", 0, 180, "degrees")
+        check_range(self, "targets", "max_shift", 0, 0.5, "m")
+        check_range(self, "targets", "ramp_pairs", 1)
+        check_range(self, "targets", "lateral_ratio", 0, 1, above=True)
 
 
 class FootstepTargets:

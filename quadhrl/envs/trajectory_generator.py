@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from quadhrl.envs.kinematics import LegKinematics, RollPitchYaw
+from quadhrl.errors import check_range
 from quadhrl.robots import Robot
 
 __all__ = ["ACTION_DIM", "TrajectoryGenerator", "TrajectoryGeneratorConfig"]
@@ -39,6 +40,17 @@ class TrajectoryGeneratorConfig:
     stance_width: float = 0.075
     """Sideways distance of the feet from the abduction joints [m]."""
 
+    def validate(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        check_range(self, "generator", "max_amplitude max_residual step_height stance_width", 0, 1, "m")
+        check_range(self, "generator", "max_frequency", 0, 10, "Hz", above=True)
+        check_range(self, "generator", "min_height", -2, self.max_height, "m")
+        check_range(self, "generator", "max_height", -2, 0, "m")
+
 
 class TrajectoryGenerator:
     """Turns actions into joint targets and keeps each world's phase.
@@ -54,6 +66,7 @@ class TrajectoryGenerator:
     def __init__(
         self, config: TrajectoryGeneratorConfig, robot: Robot, num_worlds: int, control_dt: float, device: torch.device
     ) -> None:
+        config.validate()
         self.config, self.control_dt = config, control_dt
         self.kinematics = LegKinematics(robot, device)
         self.phase = torch.zeros(num_worlds, device=device)

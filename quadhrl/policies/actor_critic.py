@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 
-from quadhrl.errors import InputError
+from quadhrl.errors import check_range
 from quadhrl.policies.normalization import ObservationNormalizer, RunningStatistics
 
 __all__ = ["ActorCritic", "NetworkConfig"]
@@ -43,14 +43,8 @@ class NetworkConfig:
         Raises:
             InputError: a field is out of its range.
         """
-        for field in ("hidden_size", "hidden_layers"):
-            if getattr(self, field) < 1:
-                flag = f"--network.{field.replace('_', '-')}"
-                raise InputError(flag, getattr(self, field), "give a whole number of at least 1")
-        for field in ("goal_gain", "scan_gain", "initial_std"):
-            if getattr(self, field) <= 0.0:
-                flag = f"--network.{field.replace('_', '-')}"
-                raise InputError(flag, getattr(self, field), "give a number above 0")
+        check_range(self, "network", "hidden_size hidden_layers", 1)
+        check_range(self, "network", "goal_gain scan_gain initial_std", 0, above=True)
 
 
 class _Gaussian(nn.Module):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from quadhrl.errors import InputError
+from quadhrl.errors import InputError, check_range
 from quadhrl.robots import Robot
 from quadhrl.sim.terrain import TerrainConfig
 
@@ -43,12 +43,8 @@ class PhysicsConfig:
         Raises:
             InputError: a field is out of its range.
         """
-        if not 0.001 <= self.control_dt <= 0.1:
-            raise InputError("--physics.control-dt", self.control_dt, "give a duration between 0.001 and 0.1 s")
-        for field in ("substeps", "solver_iterations", "line_search_iterations", "nconmax", "njmax"):
-            if getattr(self, field) < 1:
-                flag = f"--physics.{field.replace('_', '-')}"
-                raise InputError(flag, getattr(self, field), "give a whole number of at least 1")
+        check_range(self, "physics", "control_dt", 0.001, 0.1, "s")
+        check_range(self, "physics", "substeps solver_iterations line_search_iterations nconmax njmax", 1)
 
     @property
     def timestep(self) -> float:

@@ -9,7 +9,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from quadhrl.errors import InputError
+from quadhrl.errors import check_range
 
 __all__ = ["BlockTerrain", "TerrainConfig"]
 
@@ -37,18 +37,11 @@ class TerrainConfig:
         Raises:
             InputError: a field is out of its range.
         """
-        if not 0.0 <= self.infill <= 1.0:
-            raise InputError("--infill", self.infill, "give a probability between 0 and 1")
-        if not 0.0 <= self.height_range <= 0.5:
-            raise InputError("--height-range", self.height_range, "give a range between 0 and 0.5 m")
-        if not 0.05 <= self.block_size <= 2.0:
-            raise InputError("--terrain.block-size", self.block_size, "give an edge length between 0.05 and 2 m")
-        if not 0.5 <= self.gap_depth <= 10.0:
-            raise InputError("--terrain.gap-depth", self.gap_depth, "give a depth between 0.5 and 10 m")
-        for field in ("platform_length", "platform_width"):
-            if not 0.0 <= getattr(self, field) <= 5.0:
-                flag = f"--terrain.{field.replace('_', '-')}"
-                raise InputError(flag, getattr(self, field), "give an extent between 0 and 5 m")
+        check_range(self, "", "infill", 0, 1)
+        check_range(self, "", "height_range", 0, 0.5, "m")
+        check_range(self, "terrain", "block_size", 0.05, 2, "m")
+        check_range(self, "terrain", "gap_depth", 0.5, 10, "m")
+        check_range(self, "terrain", "platform_length platform_width", 0, 5, "m")
 
 
 class BlockTerrain:

@@ -72,7 +72,7 @@ def find_checkpoint(path: str | Path, field: str = "checkpoint") -> Path:
         if newest is not None:
             return newest
         raise InputError(field, str(path), "no checkpoint in this run directory; give another one")
-    raise InputError(field, str(path), "no such file or run directory; give the path of a checkpoint (*.ckpt)")
+    raise InputError(field, str(path), "no such file or run directory; give the path of a checkpoint (*.torchrl)")
 
 
 def read_metadata(path: Path, field: str = "checkpoint") -> dict[str, Any]:

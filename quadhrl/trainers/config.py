@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from quadhrl.envs import FootstepConfig
-from quadhrl.errors import InputError
+from quadhrl.errors import InputError, check_range
 from quadhrl.policies import NetworkConfig
 
 __all__ = ["PRESETS", "PPOConfig", "TrainConfig", "config_from_dict", "parse_command_line"]
@@ -53,18 +53,10 @@ class PPOConfig:
         Raises:
             InputError: a field is out of its range.
         """
-        for name in ("horizon", "epochs", "minibatches"):
-            if getattr(self, name) < 1:
-                raise InputError(f"--ppo.{name}", getattr(self, name), "give a whole number of at least 1")
-        for name in ("gamma", "lmbda"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise InputError(f"--ppo.{name}", getattr(self, name), "give a number between 0 and 1")
-        for name in ("clip_epsilon", "learning_rate", "min_learning_rate", "target_kl", "max_grad_norm"):
-            if getattr(self, name) <= 0.0:
-                raise InputError(f"--ppo.{name.replace('_', '-')}", getattr(self, name), "give a number above 0")
-        if self.max_learning_rate < self.min_learning_rate:
-            remedy = f"give at least --ppo.min-learning-rate ({self.min_learning_rate})"
-            raise InputError("--ppo.max-learning-rate", self.max_learning_rate, remedy)
+        check_range(self, "ppo", "horizon epochs minibatches", 1)
+        check_range(self, "ppo", "gamma lmbda", 0, 1)
+        check_range(self, "ppo", "clip_epsilon learning_rate min_learning_rate target_kl max_grad_norm", 0, above=True)
+        check_range(self, "ppo", "max_learning_rate", self.min_learning_rate)
 
 
 @dataclass
@@ -111,14 +103,9 @@ class TrainConfig:
         """
         if self.task not in TASKS:
             raise InputError("--task", self.task, f"choose one of: {', '.join(TASKS)}")
-        if self.num_envs < 1:
-            raise InputError("--num-envs", self.num_envs, "give a whole number of at least 1")
-        if self.total_steps < 1:
-            raise InputError("--total-steps", self.total_steps, "give a whole number of at least 1")
-        if self.max_minutes < 0.0:
-            raise InputError("--max-minutes", self.max_minutes, "give a time above 0 min, or 0 for no limit")
-        if self.checkpoint_minutes <= 0.0:
-            raise InputError("--checkpoint-minutes", self.checkpoint_minutes, "give a time above 0 min")
+        check_range(self, "", "num_envs total_steps", 1)
+        check_range(self, "", "max_minutes", 0, unit="min")
+        check_range(self, "", "checkpoint_minutes", 0, unit="min", above=True)
         if self.num_envs * self.ppo.horizon < self.ppo.minibatches:
             remedy = f"give at most --num-envs x --ppo.horizon ({self.num_envs * self.ppo.horizon})"
             raise InputError("--ppo.minibatches", self.ppo.minibatches, remedy)
