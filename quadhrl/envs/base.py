@@ -223,6 +223,7 @@ class LocomotionEnv(EnvBase):
         self._previous_action[worlds] = 0.0
         self.step_count[worlds] = 0
         self._reset_task(worlds)
+        self._attitude = roll_pitch_yaw(self.sim.readings.base_quaternion)
         fresh = self._observe(worlds)
         fresh["reward_terms"] = TensorDict(
             {name: torch.zeros(len(worlds), 1, device=self.device) for name in self.reward_names}
@@ -306,15 +307,9 @@ class LocomotionEnv(EnvBase):
         }
 
     def _observe(self, worlds: Tensor) -> dict[str, Any]:
-        readings = self.sim.readings
+        readings, subset = self.sim.readings, None
         if len(worlds) < self.num_envs:
-            readings = readings[worlds]
-            for angle, fresh in zip(self._attitude, roll_pitch_yaw(readings.base_quaternion), strict=True):
-                angle[worlds] = fresh
-            subset = worlds
-        else:
-            self._attitude = roll_pitch_yaw(readings.base_quaternion)
-            subset = None
+            readings, subset = readings[worlds], worlds
         return {
             "scan": scan(self.terrain, readings.foot_position, self._scan_pattern, self.config.scan_clip, subset),
             **self._task_observation(readings, worlds),

@@ -72,7 +72,12 @@ class WorldView:
         blocks = np.rint(self.data.qpos[:2] / size).astype(int) + self.scene.block_offset
         world = torch.tensor([self.world], device=terrain.device)
         tops = terrain.block_heights(torch.as_tensor(blocks, device=terrain.device)[None], world)[0].cpu().numpy()
-        model.geom_pos[ids] = np.column_stack([(blocks + 0.5) * size, tops - terrain.config.gap_depth / 2])
+        gap = tops < -0.5 * terrain.config.gap_depth
+        shown = np.where(
+            gap, -0.12, tops
+        )  # a black floor a little below the rims: from the side a deep hole shows only walls
+        model.geom_pos[ids] = np.column_stack([(blocks + 0.5) * size, shown - terrain.config.gap_depth / 2])
         model.geom_size[ids, :2] = size / 2  # without the simulators' overlap, whose level faces would flicker
         shade = 0.05 * ((blocks.sum(1) % 2) - 0.5) + 1.2 * np.clip(tops, -0.1, 0.1)
-        model.geom_rgba[ids, :3] = np.clip(np.array([0.78, 0.75, 0.69]) + shade[:, None], 0, 1)
+        level = np.clip(np.array([0.78, 0.75, 0.69]) + shade[:, None], 0, 1)
+        model.geom_rgba[ids, :3] = np.where(gap[:, None], 0.03, level)
