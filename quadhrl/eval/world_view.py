@@ -73,9 +73,8 @@ class WorldView:
         world = torch.tensor([self.world], device=terrain.device)
         tops = terrain.block_heights(torch.as_tensor(blocks, device=terrain.device)[None], world)[0].cpu().numpy()
         gap = tops < -0.5 * terrain.config.gap_depth
-        shown = np.where(
-            gap, -0.12, tops
-        )  # a black floor a little below the rims: from the side a deep hole shows only walls
+        # A black floor a little below the rims: seen from the side, a deep hole shows only its walls.
+        shown = np.where(gap, -0.04, tops)
         model.geom_pos[ids] = np.column_stack([(blocks + 0.5) * size, shown - terrain.config.gap_depth / 2])
         model.geom_size[ids, :2] = size / 2  # without the simulators' overlap, whose level faces would flicker
         shade = 0.05 * ((blocks.sum(1) % 2) - 0.5) + 1.2 * np.clip(tops, -0.1, 0.1)
