@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from quadhrl.envs import rewards
 from quadhrl.envs.curriculum import CurriculumConfig, TerrainCurriculum
-from quadhrl.envs.kinematics import RollPitchYaw, roll_pitch_yaw, rotate_yaw
+from quadhrl.envs.kinematics import RollPitchYaw, roll_pitch_yaw, rotate_vectors, rotate_yaw
 from quadhrl.envs.scan import SCAN_POINTS, scan, scan_pattern
 from quadhrl.envs.threads import one_thread_for_small_batches
 from quadhrl.envs.trajectory_generator import ACTION_DIM, TrajectoryGenerator, TrajectoryGeneratorConfig
@@ -370,10 +370,3 @@ class LocomotionEnv(EnvBase):
     @abstractmethod
     def _load_task_state(self, state: dict[str, Tensor]) -> None:
         """Restore the task's own part of `state_dict`."""
-
-
-def rotate_vectors(quaternion: Tensor, vectors: Tensor) -> Tensor:
-    """Rotate vectors [N, M, 3] by quaternions wxyz [N, 4]."""
-    w, axis = quaternion[:, None, :1], quaternion[:, None, 1:].expand_as(vectors)
-    twice = 2.0 * torch.linalg.cross(axis, vectors)
-    return vectors + w * twice + torch.linalg.cross(axis, twice)

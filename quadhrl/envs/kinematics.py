@@ -9,7 +9,7 @@ from torch import Tensor
 
 from quadhrl.robots import Robot
 
-__all__ = ["LegKinematics", "RollPitchYaw", "roll_pitch_yaw", "rotate_yaw"]
+__all__ = ["LegKinematics", "RollPitchYaw", "roll_pitch_yaw", "rotate_vectors", "rotate_yaw"]
 
 
 class RollPitchYaw(NamedTuple):
@@ -41,6 +41,13 @@ def rotate_yaw(vector: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     x, y = vector[..., 0], vector[..., 1]
     rotated = torch.stack([cos * x - sin * y, sin * x + cos * y], -1)
     return rotated if vector.shape[-1] == 2 else torch.cat([rotated, vector[..., 2:]], -1)
+
+
+def rotate_vectors(quaternion: Tensor, vectors: Tensor) -> Tensor:
+    """Rotate vectors [N, M, 3] by quaternions wxyz [N, 4]."""
+    w, axis = quaternion[:, None, :1], quaternion[:, None, 1:].expand_as(vectors)
+    twice = 2.0 * torch.linalg.cross(axis, vectors)
+    return vectors + w * twice + torch.linalg.cross(axis, twice)
 
 
 class LegKinematics:

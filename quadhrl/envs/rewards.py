@@ -18,7 +18,7 @@ __all__ = [
 
 
 def target_closeness(distance: Tensor, hit: Tensor, hit_radius: float) -> Tensor:
-    """The common part of eqs. 4 and 7: ``h (1 + 0.5 (1 - d / d_hit))`` per foot.
+    """The common part of eqs. 4 and 8: ``h (1 + 0.5 (1 - d / d_hit))`` per foot.
 
     Args:
         distance: horizontal distance of each foot from its target [m], [N, 4].
@@ -35,7 +35,7 @@ def footstep_target(closeness: Tensor, hit: Tensor, active: Tensor) -> Tensor:
 
 
 def foot_stay(closeness: Tensor, active: Tensor) -> Tensor:
-    """Eq. 7: the same sum over the stance feet and their current targets."""
+    """Eq. 8: the same sum over the stance feet and their current targets."""
     return (closeness * ~active).sum(-1)
 
 
@@ -59,7 +59,7 @@ def smoothness(action: Tensor, previous: Tensor, before_previous: Tensor) -> Ten
 
 
 def foot_slip(moved: Tensor, contact: Tensor, contact_before: Tensor, limit: float) -> Tensor:
-    """Foot slip penalty: minus the number of feet in contact now and before that moved farther than ``limit``.
+    """Eq. 7: minus the number of feet in contact now and before that moved farther than ``limit``.
 
     Args:
         moved: horizontal displacement of each foot in this step [m], [N, 4, 2].
@@ -72,10 +72,10 @@ def foot_slip(moved: Tensor, contact: Tensor, contact_before: Tensor, limit: flo
 
 
 def collision(collisions: Tensor) -> Tensor:
-    """Eq. 8: minus the number of colliding links, [N] int."""
+    """Eq. 9: minus the number of colliding links, [N] int."""
     return -collisions.float()
 
 
 def swing_phase(swing_window: Tensor, frequency: Tensor) -> Tensor:
-    """Eq. 9: the generator's frequency [Hz] while its phase is in S, [N] each."""
+    """Eq. 10: the generator's frequency [Hz] while its phase is in S, [N] each."""
     return torch.where(swing_window, frequency, 0.0)

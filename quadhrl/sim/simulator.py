@@ -169,9 +169,9 @@ class Simulator(ABC):
         qpos = home if qpos is None else qpos.to(self._home)
         qvel = self._home.new_zeros(len(worlds), self.scene.model.nv) if qvel is None else qvel.to(self._home)
         self._write(worlds, qpos, qvel, ctrl=self._home[7:].expand(len(worlds), -1))
+        self._lay_around(worlds, qpos[:, :2])
         self._forward(worlds)
         self.readings = self.readings.replace(**self._kinematics())
-        self._lay_around_robots(worlds)
         self._silence(worlds)
         return self.readings
 
@@ -229,7 +229,7 @@ class Simulator(ABC):
 
     @abstractmethod
     def _forward(self, worlds: Tensor) -> None:
-        """Bring positions and velocities of the feet up to date with the state of at least these worlds, without stepping."""
+        """Bring what follows from state and boxes up to date in at least these worlds, without stepping."""
 
     @abstractmethod
     def _kinematics(self) -> dict[str, Tensor]:
@@ -276,18 +276,19 @@ class Simulator(ABC):
         if self._steps % FOLLOW_STEPS:
             return
         # Half a block is enough to leave; the rest keeps a robot on an edge from moving its window again and again.
-        away = (self._in_blocks() - self._centre).abs().amax(-1) > 0.6
+        xy = self.readings.base_position[:, :2]
+        away = (xy / self.terrain.config.block_size - self._centre).abs().amax(-1) > 0.6
         worlds = away.nonzero().squeeze(-1)
         if len(worlds):
-            self._lay_around_robots(worlds)
+            self._lay_around(worlds, xy[worlds])
+            self._forward(
+                worlds
+            )  # the native engine has found the next step's first contacts already, with the old boxes
 
-    def _lay_around_robots(self, worlds: Tensor) -> None:
-        self._centre[worlds] = torch.round(self._in_blocks()[worlds]).long()
+    def _lay_around(self, worlds: Tensor, xy: Tensor) -> None:
+        """Lay the windows of some worlds around horizontal positions [K, 2], m."""
+        self._centre[worlds] = torch.round(xy / self.terrain.config.block_size).long()
         self._lay(worlds)
-
-    def _in_blocks(self) -> Tensor:
-        """Horizontal position of each base in units of a block [N, 2]."""
-        return self.readings.base_position[:, :2] / self.terrain.config.block_size
 
     def _lay(self, worlds: Tensor) -> None:
         """Lay the windows of some worlds around their `_centre`."""

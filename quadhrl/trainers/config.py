@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import tyro
 
@@ -176,9 +176,7 @@ def config_from_dict(values: dict[str, Any], cls: Any = TrainConfig, where: str 
     Raises:
         InputError: a field is unknown (the file is from another version).
     """
-    import typing
-
-    hints = typing.get_type_hints(cls)
+    hints = get_type_hints(cls)
     known = {f.name for f in dataclasses.fields(cls)}
     for name in values:
         if name not in known:

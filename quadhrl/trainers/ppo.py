@@ -227,10 +227,10 @@ def train(config: TrainConfig) -> None:
         trainer.load(resume_from)
     directory = RunDirectory(config)
     stop = _StopRequest()
-    best = {"reward": -math.inf}
+    latest = {"reward": -math.inf}
 
     def save() -> None:
-        directory.save(checkpoint, trainer.samples, wall_seconds=trainer.wall_seconds, **best)
+        directory.save(checkpoint, trainer.samples, wall_seconds=trainer.wall_seconds, **latest)
 
     checkpoint = trainer.checkpoint()
     began = last_save = time.monotonic()
@@ -241,7 +241,7 @@ def train(config: TrainConfig) -> None:
             if config.max_minutes and time.monotonic() - began > 60.0 * config.max_minutes:
                 break
             scalars = trainer.iterate()
-            best = {"reward": scalars["rollout/reward"]}
+            latest = {"reward": scalars["rollout/reward"]}
             directory.log(scalars, trainer.samples)
             progress.update(trainer.samples, scalars)
             if time.monotonic() - last_save > 60.0 * config.checkpoint_minutes:
