@@ -57,7 +57,7 @@ class NativeSimulator(Simulator):
         self.batch.warning[:] = 0
         self._lost.zero_()
         try:
-            # A persistent batch begins its next step from the stages computed here, so fresh foot kinematics cost nothing.
+            # The stage brings the feet's sensors from the last substep's beginning to its end.
             self.batch.step(nstep=self.scene.physics.substeps, stage=int(mujoco.mjtStage.mjSTAGE_VEL))
         except SimulationError as error:
             self._lost[torch.as_tensor(error.ids, dtype=torch.long)] = True

@@ -281,9 +281,6 @@ class Simulator(ABC):
         worlds = away.nonzero().squeeze(-1)
         if len(worlds):
             self._lay_around(worlds, xy[worlds])
-            self._forward(
-                worlds
-            )  # the native engine has found the next step's first contacts already, with the old boxes
 
     def _lay_around(self, worlds: Tensor, xy: Tensor) -> None:
         """Lay the windows of some worlds around horizontal positions [K, 2], m."""
