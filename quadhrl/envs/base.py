@@ -98,6 +98,8 @@ class LocomotionEnv(EnvBase):
     batch_locked = True
     reward_names: tuple[str, ...]
     """Names of the task's reward terms."""
+    network_inputs: dict[str, int]
+    """Observation keys that policy and value function see, and their sizes, in input order."""
 
     def __init__(
         self,
@@ -120,8 +122,6 @@ class LocomotionEnv(EnvBase):
         self.terrain = self.sim.terrain
         self.curriculum = TerrainCurriculum(config.curriculum, self.terrain)
         self.generator = TrajectoryGenerator(config.generator, robot, num_envs, config.physics.control_dt, device)
-        self.rng = torch.Generator(device).manual_seed(seed)
-        """Source of all of the task's randomness; the terrains have their own, a hash of seed, world and episode."""
         self.step_count = torch.zeros(num_envs, dtype=torch.long, device=device)
         """Steps of the present episode [N]."""
         self._previous_action = torch.zeros(num_envs, 2, ACTION_DIM, device=device)  # the last, and the one before
@@ -199,7 +199,6 @@ class LocomotionEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
-            self.rng.manual_seed(seed)
             self.terrain.seed = seed
             self.terrain.episode.fill_(-1)
 
@@ -341,7 +340,6 @@ class LocomotionEnv(EnvBase):
         return {
             "simulator": self.sim.state_dict(),
             "generator": {"phase": self.generator.phase, "frequency": self.generator.frequency},
-            "rng": self.rng.get_state(),
             "step_count": self.step_count,
             "level": self.curriculum.level,
             "previous_action": self._previous_action,
@@ -354,7 +352,6 @@ class LocomotionEnv(EnvBase):
         self.sim.load_state_dict(state["simulator"])
         self.generator.phase.copy_(state["generator"]["phase"])
         self.generator.frequency = state["generator"]["frequency"].to(self.device)
-        self.rng.set_state(state["rng"].cpu())
         self.step_count.copy_(state["step_count"])
         self.curriculum.level.copy_(state["level"])
         self._previous_action = state["previous_action"].to(self.device)

@@ -6,12 +6,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
 from quadhrl.envs import rewards
 from quadhrl.envs.base import LocomotionConfig, LocomotionEnv, SharedRewardConfig, TerminationConfig
 from quadhrl.envs.kinematics import rotate_yaw
+from quadhrl.envs.scan import SCAN_POINTS
 from quadhrl.envs.targets import FootstepTargets, TargetConfig
 from quadhrl.errors import check_range
 from quadhrl.sim import Readings
@@ -76,10 +78,15 @@ class FootstepEnv(LocomotionEnv):
     ``proprioception`` holds foot positions (12) and velocities (12), joint torques (12), roll, pitch and their rates (4),
     foot contacts (4), the active feet (4), cos and sin of the phase (2) and the last two actions (30). ``goal`` holds the
     horizontal vector from each foot to its target (8: the next one of an active foot, the current one of a stance foot) and
-    from the two stance feet to their following targets (4), turned by -yaw.
+    from the two stance feet to their following targets (4), turned by -yaw. A policy that sets another ``goal`` gives the
+    robot other targets: the environment adopts them before it steps.
+
+    For policies that choose targets, in the world's frame: ``yaw`` [N, 1] (rad), ``feet`` [N, 4, 2] (m), ``footholds``
+    [N, 4, 2], the target that each foot hit last (m), and ``pair`` [N, 1], the number of the active pair.
     """
 
     config: FootstepConfig
+    network_inputs = {"proprioception": 80, "goal": 12, "scan": 4 * SCAN_POINTS}
     reward_names = (
         "footstep_target",
         "velocity_towards_target",
@@ -94,21 +101,32 @@ class FootstepEnv(LocomotionEnv):
 
     def _set_up_task(self) -> None:
         self.config.rewards.validate()
-        self.targets = FootstepTargets(self.config.targets, self.nominal_feet, self.num_envs, self.rng)
+        self.targets = FootstepTargets(self.config.targets, self.nominal_feet, self.num_envs)
         self.steps_since_hit = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         """Control steps since the last pair was hit, or since the episode began [N]."""
         self._stuck_steps = round(self.config.termination.stuck_seconds / self.config.physics.control_dt)
         self._pair_hit = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self._adopt_choices(tensordict)
+        out = super()._step(tensordict)
+        return out.set(
+            "goal", out["goal"].clone()
+        )  # a policy may write into it; `_adopt_choices` compares with the original
 
     def _task_specs(self) -> dict[str, Any]:
         n = self.num_envs
         return {
             "proprioception": Unbounded(shape=(n, 80), device=self.device),
             "goal": Unbounded(shape=(n, 12), device=self.device),
+            "yaw": Unbounded(shape=(n, 1), device=self.device),
+            "feet": Unbounded(shape=(n, 4, 2), device=self.device),
+            "footholds": Unbounded(shape=(n, 4, 2), device=self.device),
+            "pair": Unbounded(shape=(n, 1), dtype=torch.long, device=self.device),
         }
 
     def _reset_task(self, worlds: Tensor) -> None:
-        self.targets.reset(worlds)
+        self.targets.reset(worlds, self.terrain.key[worlds])
         self.steps_since_hit[worlds] = 0
 
     def _episode_score(self, worlds: Tensor) -> Tensor:
@@ -150,20 +168,31 @@ class FootstepEnv(LocomotionEnv):
         return {
             "proprioception": torch.cat([*parts, *self._phase_and_actions(worlds)], -1),
             "goal": rotate_yaw(to_targets, torch.cos(yaw), -torch.sin(yaw)).flatten(1),
+            "yaw": yaw,
+            "feet": feet,
+            "footholds": targets.footholds[worlds],
+            "pair": targets.index[worlds][:, None],
         }
+
+    def _adopt_choices(self, tensordict: TensorDictBase) -> None:
+        """Where the policy has set another goal than the one observed, turn it back into targets in the world."""
+        goal, observed = tensordict.get("goal", None), self._observation["goal"]
+        if goal is None:
+            return
+        targets, yaw = self.targets, self._attitude.yaw[:, None]
+        feet = self.sim.readings.foot_position[..., :2]
+        stance_feet = feet.gather(1, targets.stance_feet[..., None].expand(-1, -1, 2))
+        vectors = rotate_yaw(goal.view(-1, 6, 2), torch.cos(yaw), torch.sin(yaw))
+        # Only what was changed: turning there and back would move the other targets by rounding errors, step by step.
+        changed = ((goal != observed) & goal.isfinite()).view(-1, 6, 2).any(-1, keepdim=True)
+        targets.adopt(
+            torch.where(changed[:, :4], feet + vectors[:, :4], targets.position),
+            torch.where(changed[:, 4:], stance_feet + vectors[:, 4:], targets.following),
+        )
 
     def _task_state(self) -> dict[str, Tensor]:
-        targets = self.targets
-        return {
-            "index": targets.index,
-            "position": targets.position,
-            "following": targets.following,
-            "step": targets._step,
-            "steps_since_hit": self.steps_since_hit,
-        }
+        return self.targets.state_dict() | {"steps_since_hit": self.steps_since_hit}
 
     def _load_task_state(self, state: dict[str, Tensor]) -> None:
-        targets = self.targets
-        targets.index, targets.position = state["index"].to(self.device), state["position"].to(self.device)
-        targets.following, targets._step = state["following"].to(self.device), state["step"].to(self.device)
+        self.targets.load_state_dict(state)
         self.steps_since_hit = state["steps_since_hit"].to(self.device)

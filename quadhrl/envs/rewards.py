@@ -1,4 +1,4 @@
-"""The reward terms of the paper, section II-D, unweighted; one function per equation. All are [N], per control step."""
+"""The reward terms of the paper, sections II-D and IV-B, unweighted; one function per equation, [N] per control step."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ __all__ = [
     "footstep_target",
     "foot_slip",
     "foot_stay",
+    "forward_velocity",
+    "lateral_velocity",
     "smoothness",
     "swing_phase",
     "target_closeness",
@@ -79,3 +81,13 @@ def collision(collisions: Tensor) -> Tensor:
 def swing_phase(swing_window: Tensor, frequency: Tensor) -> Tensor:
     """Eq. 10: the generator's frequency [Hz] while its phase is in S, [N] each."""
     return torch.where(swing_window, frequency, 0.0)
+
+
+def forward_velocity(velocity: Tensor, limit: float) -> Tensor:
+    """Eq. 15: the base's velocity along x [m/s], [N], clipped above at ``limit``."""
+    return velocity.clamp(max=limit)
+
+
+def lateral_velocity(velocity: Tensor, power: int) -> Tensor:
+    """Eq. 16: minus the speed along y [m/s], [N], to the given power."""
+    return -(velocity.abs() ** power)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from quadhrl.errors import check_range
+from quadhrl.hashing import hash_key, hash_uniform
 
 __all__ = ["FootstepTargets", "TargetConfig"]
 
@@ -51,12 +52,11 @@ class FootstepTargets:
         config: how sequences are drawn.
         nominal: nominal foot positions around the origin [m], [4, 2].
         num_worlds: number of worlds, N.
-        generator: source of all randomness.
     """
 
-    def __init__(self, config: TargetConfig, nominal: Tensor, num_worlds: int, generator: torch.Generator) -> None:
+    def __init__(self, config: TargetConfig, nominal: Tensor, num_worlds: int) -> None:
         config.validate()
-        self.config, self._nominal, self._generator = config, nominal, generator
+        self.config, self._nominal = config, nominal
         device = nominal.device
         self.index = torch.ones(num_worlds, dtype=torch.long, device=device)
         """Number of the active pair [N]; odd: (FR, RL), even: (FL, RR)."""
@@ -64,6 +64,11 @@ class FootstepTargets:
         """World target of each foot [N, 4, 2], m: the next one of an active foot, the current one of a stance foot."""
         self.following = torch.zeros(num_worlds, 2, 2, device=device)
         """World targets of the stance pair after its current ones, front foot then rear foot [N, 2, 2], m."""
+        self.footholds = nominal.expand(num_worlds, 4, 2).clone()
+        """World target that each foot hit last [N, 4, 2], m: the one that a stance foot stands on, that an active foot left."""
+        self._key = torch.zeros(
+            num_worlds, dtype=torch.long, device=device
+        )  # what each world's randomness follows from
         self._step = torch.zeros(num_worlds, 2, device=device)  # displacement per pair, m
         self._pairs = torch.tensor([[0, 3], [1, 2]], device=device)  # feet of even and of odd pairs, front foot first
         self._active = torch.tensor([[True, False, False, True], [False, True, True, False]], device=device)
@@ -78,10 +83,15 @@ class FootstepTargets:
         """Indices of the stance pair's feet, front foot first [N, 2]."""
         return self._pairs[(self.index + 1) % 2]
 
-    def reset(self, worlds: Tensor) -> None:
-        """Draw new sequences for the worlds [K], starting from the nominal places around the origin."""
-        everyone = len(self.index)
-        draws = torch.rand(everyone, 2, generator=self._generator, device=self._nominal.device)[worlds]
+    def reset(self, worlds: Tensor, key: Tensor) -> None:
+        """Draw new sequences, starting from the nominal places around the origin.
+
+        Args:
+            worlds: the worlds, [K].
+            key: what all of each sequence follows from, [K], int64.
+        """
+        self._key[worlds] = key
+        draws = hash_uniform(hash_key(key, 0), 2)
         length = draws[:, 0] * self.config.max_step
         heading = (2.0 * draws[:, 1] - 1.0) * torch.pi * self.config.max_heading / 180.0
         cos, sin, ratio = torch.cos(heading), torch.sin(heading), self.config.lateral_ratio
@@ -89,9 +99,31 @@ class FootstepTargets:
         self._step[worlds] = torch.stack([length * cos, length * sin], -1)
         self.index[worlds] = 1
         self.position[worlds] = self._nominal
+        self.footholds[worlds] = self._nominal
         pair_1, pair_2 = self._draw(1), self._draw(2)
         self.position[worlds[:, None], self._pairs[1]] = pair_1[worlds]
         self.following[worlds] = pair_2[worlds]
+
+    def adopt(self, position: Tensor, following: Tensor) -> None:
+        """Take over the targets that a policy chose, in every world.
+
+        Args:
+            position: the feet's next (active) or current (stance) targets [N, 4, 2], m.
+            following: the stance pair's following targets [N, 2, 2], m.
+        """
+        self.position, self.following = position, following
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Where every world's sequence stands."""
+        names = ("index", "position", "following", "footholds")
+        return {name: getattr(self, name) for name in names} | {"key": self._key, "step": self._step}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` gave."""
+        device = self._nominal.device
+        for name in ("index", "position", "following", "footholds"):
+            setattr(self, name, state[name].to(device))
+        self._key, self._step = state["key"].to(device), state["step"].to(device)
 
     def advance(self, hit: Tensor) -> None:
         """Move on to the next pair in the worlds where the active pair was hit.
@@ -103,6 +135,7 @@ class FootstepTargets:
             1, self.stance_feet[..., None].expand(-1, -1, 2), self.following
         )
         stance = ~self.active
+        self.footholds = torch.where(hit[:, None, None], self.position, self.footholds)
         self.position = torch.where((hit[:, None] & stance)[..., None], arrived, self.position)
         self.index = self.index + hit
         self.following = torch.where(hit[:, None, None], self._draw(self.index + 1), self.following)
@@ -111,7 +144,7 @@ class FootstepTargets:
         """Draw the targets of pair number ``pair`` in every world [N, 2, 2]; the worlds that need none ignore theirs."""
         device = self._nominal.device
         number = torch.as_tensor(pair, device=device).expand(len(self.index))
-        shift = torch.rand(len(number), 2, 2, generator=self._generator, device=device) * 2.0 - 1.0
+        shift = hash_uniform(hash_key(self._key, number), 4).view(-1, 2, 2) * 2.0 - 1.0
         ramp = ((number - 1) / max(self.config.ramp_pairs - 1, 1)).clamp(max=1.0) if self.config.ramp_pairs > 1 else 1.0
         scale = self.config.max_shift * torch.as_tensor(ramp, device=device).expand(len(number))
         nominal = self._nominal[self._pairs[number % 2]]

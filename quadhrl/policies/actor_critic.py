@@ -12,7 +12,7 @@ from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOpe
 from quadhrl.errors import check_range
 from quadhrl.policies.normalization import ObservationNormalizer, RunningStatistics
 
-__all__ = ["ActorCritic", "NetworkConfig"]
+__all__ = ["ActorCritic", "Denormalize", "NetworkConfig"]
 
 
 @dataclass
@@ -65,7 +65,7 @@ class _Gaussian(nn.Module):
         return loc, self.log_std.exp().expand_as(loc)
 
 
-class _Denormalize(nn.Module):
+class Denormalize(nn.Module):
     """Value in reward units from the critic's normalised one."""
 
     def __init__(self, statistics: RunningStatistics) -> None:
@@ -114,7 +114,7 @@ class ActorCritic(nn.Module):
 
     def value(self) -> TensorDictSequential:
         """Observations -> ``state_value`` [..., 1], the expected discounted return in reward units; differentiable."""
-        denormalize = TensorDictModule(_Denormalize(self.value_statistics), ["normalized_value"], ["state_value"])
+        denormalize = TensorDictModule(Denormalize(self.value_statistics), ["normalized_value"], ["state_value"])
         return TensorDictSequential(self.normalizer, self.critic, denormalize)
 
 

@@ -185,16 +185,12 @@ class Simulator(ABC):
             "steps": self._steps,
             "fault": self.fault,
             "fault_counts": self.fault_counts,
-            "terrain": {
-                "episode": self.terrain.episode,
-                "infill": self.terrain.infill,
-                "height_range": self.terrain.height_range,
-            },
+            "terrain": self.terrain.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` gave, from a simulator with the same scene and number of worlds."""
-        self.terrain.set_episode(**state["terrain"])
+        self.terrain.load_state_dict(state["terrain"])
         self.readings = Readings(**{name: value.to(self.device) for name, value in state["readings"].items()})
         everyone = torch.arange(self.num_worlds, device=self.device)
         self._centre.copy_(state["centre"])

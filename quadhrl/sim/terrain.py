@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
 from torch import Tensor
 
 from quadhrl.errors import check_range
+from quadhrl.hashing import hash_key, hash_uniform
 
 __all__ = ["BlockTerrain", "TerrainConfig"]
 
@@ -45,7 +46,7 @@ class TerrainConfig:
 
 
 class BlockTerrain:
-    """One random, endless block terrain per world, a pure function of (seed, world, episode).
+    """One random, endless block terrain per world, a pure function of (seed, world's number, episode).
 
     Block ``(i, j)`` covers ``[i b, (i+1) b) x [j b, (j+1) b)``. The terrain repeats every `PERIOD` blocks. `heights` is the
     only height query: the scan, the simulators' boxes, the renderer and the tests all use it.
@@ -68,6 +69,10 @@ class BlockTerrain:
         self.num_worlds = num_worlds
         self.seed = seed
         self.device = torch.device(device)
+        self.number = torch.arange(num_worlds, device=self.device)
+        """Each world's number [N], its index unless `assign` gave it another."""
+        self.key = torch.zeros_like(self.number)
+        """Hash of seed, number and episode [N]: what else is random in a world's episode can be drawn from it."""
         self.infill = torch.full((num_worlds,), float(config.infill), device=self.device)
         """Per-world infill [N], used at a world's next `regenerate`."""
         self.height_range = torch.full((num_worlds,), float(config.height_range), device=self.device)
@@ -89,11 +94,28 @@ class BlockTerrain:
         self.episode[worlds] += 1
         self._build(worlds)
 
-    def set_episode(self, episode: Tensor, infill: Tensor, height_range: Tensor) -> None:
-        """Restore every world's terrain from its number and difficulty, each [N]."""
-        self.episode.copy_(episode)
+    def assign(self, number: Tensor, infill: Tensor, height_range: Tensor) -> None:
+        """Give every world a number and a difficulty of its own, from its next `regenerate` on.
+
+        Args:
+            number: worlds of the same number have the same terrains [N], int64.
+            infill: [N].
+            height_range: [N], m.
+        """
+        self.number.copy_(number)
         self.infill.copy_(infill)
         self.height_range.copy_(height_range)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What every world's present and next terrains follow from, beside the config."""
+        names = ("seed", "number", "infill", "height_range", "episode")
+        return {name: getattr(self, name) for name in names}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` gave."""
+        self.seed = int(state["seed"])
+        self.assign(state["number"], state["infill"], state["height_range"])
+        self.episode.copy_(state["episode"])
         self._build(torch.arange(self.num_worlds, device=self.device))
 
     def heights(self, xy: Tensor, worlds: Tensor | None = None) -> Tensor:
@@ -134,9 +156,9 @@ class BlockTerrain:
         return self._table.view(-1).index_select(0, index.view(-1)).view(index.shape)
 
     def _build(self, worlds: Tensor) -> None:
-        key = _hash(_hash(_hash(torch.full_like(worlds, self.seed)) ^ worlds) ^ self.episode[worlds])[:, None]
-        cells = torch.arange(self.PERIOD * self.PERIOD, device=self.device)[None]
-        presence, height = _uniform(_hash(key ^ _hash(2 * cells))), _uniform(_hash(key ^ _hash(2 * cells + 1)))
+        key = hash_key(self.seed, self.number[worlds], self.episode[worlds])
+        self.key[worlds] = key
+        presence, height = hash_uniform(key, 2 * self.PERIOD * self.PERIOD).view(len(worlds), -1, 2).unbind(-1)
         height_range = self.height_range[worlds]
         tops = (height - 0.5) * height_range[:, None]
         tops = torch.where(presence < self.infill[worlds][:, None], tops, -self.config.gap_depth)
@@ -149,17 +171,3 @@ class BlockTerrain:
         centre = torch.where(centre > self.PERIOD / 2, centre - self.PERIOD, centre) * self.config.block_size
         in_x, in_y = centre.abs() < self.config.platform_length / 2, centre.abs() < self.config.platform_width / 2
         return (in_x[:, None] & in_y[None]).flatten()
-
-
-def _hash(x: Tensor) -> Tensor:
-    """The 32-bit integer hash "lowbias32" (Wellons 2018), on int64 tensors."""
-    mask = 0xFFFFFFFF
-    x = x & mask
-    x = ((x ^ (x >> 16)) * 0x7FEB352D) & mask
-    x = ((x ^ (x >> 15)) * 0x846CA68B) & mask
-    return x ^ (x >> 16)
-
-
-def _uniform(bits: Tensor) -> Tensor:
-    """32 random bits to a float32 in [0, 1)."""
-    return (bits >> 8).float() * (1.0 / (1 << 24))

@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
-from quadhrl.envs.scan import SCAN_POINTS
+from quadhrl.envs import ENVIRONMENTS
 from quadhrl.envs.trajectory_generator import ACTION_DIM
 from quadhrl.errors import InputError
 from quadhrl.policies import ActorCritic
-from quadhrl.trainers.config import TrainConfig, config_from_dict
+from quadhrl.trainers.config import TrainConfig, train_config_from_dict
 
 __all__ = [
     "FORMAT_VERSION",
@@ -29,9 +29,6 @@ __all__ = [
 FORMAT_VERSION = 1
 """Version of the checkpoints' content; raise it when old files can no longer be read."""
 
-OBSERVATIONS = {"footstep": {"proprioception": 80, "goal": 12, "scan": 4 * SCAN_POINTS}}
-"""Observation keys and sizes of each task's networks, in input order."""
-
 
 @dataclass(frozen=True)
 class LoadedPolicy:
@@ -45,7 +42,7 @@ class LoadedPolicy:
 
 def build_networks(config: TrainConfig) -> ActorCritic:
     """Fresh networks for a config's task."""
-    return ActorCritic(OBSERVATIONS[config.task], ACTION_DIM, config.network)
+    return ActorCritic(ENVIRONMENTS[config.task].network_inputs, ACTION_DIM, config.network)
 
 
 def rotation(directory: Path) -> CheckpointRotation:
@@ -111,7 +108,7 @@ def load_networks(
     facts = read_metadata(path, field)
     if task is not None and facts["task"] != task:
         raise InputError(field, str(path), f"it was trained for the task {facts['task']!r}; give one for {task!r}")
-    config = config_from_dict(facts["config"], where=f"{field} {path}")
+    config = train_config_from_dict(facts["config"], where=f"{field} {path}")
     networks = build_networks(config)
     try:
         Checkpoint(networks=networks).load(path, components={"networks"}, map_location="cpu")

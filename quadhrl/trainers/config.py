@@ -9,11 +9,20 @@ from typing import Annotated, Any, get_type_hints
 
 import tyro
 
-from quadhrl.envs import FootstepConfig
+from quadhrl.envs import FootstepConfig, ForwardConfig
 from quadhrl.errors import InputError, check_range
 from quadhrl.policies import NetworkConfig
 
-__all__ = ["PRESETS", "PPOConfig", "TrainConfig", "config_from_dict", "parse_command_line"]
+__all__ = [
+    "PRESETS",
+    "TASKS",
+    "ForwardTrainConfig",
+    "PPOConfig",
+    "TrainConfig",
+    "config_from_dict",
+    "parse_command_line",
+    "train_config_from_dict",
+]
 
 
 @dataclass
@@ -66,7 +75,7 @@ class TrainConfig:
     preset: str = "cpu"
     """Where the other fields' defaults come from: paper (4000 worlds, 300 M samples, for a GPU), cpu or smoke."""
     task: str = "footstep"
-    """What to learn: footstep (the low-level policy)."""
+    """What to learn: footstep (the low-level policy) or forward (the end-to-end baseline)."""
     engine: str = "auto"
     """Physics engine: warp, native (MuJoCo C, CPU only) or auto (warp on CUDA, native on the CPU)."""
     device: str = "auto"
@@ -101,8 +110,7 @@ class TrainConfig:
         Raises:
             InputError: a field is out of its range.
         """
-        if self.task not in TASKS:
-            raise InputError("--task", self.task, f"choose one of: {', '.join(TASKS)}")
+        _check_task(self.task)
         check_range(self, "", "num_envs total_steps", 1)
         check_range(self, "", "max_minutes", 0, unit="min")
         check_range(self, "", "checkpoint_minutes", 0, unit="min", above=True)
@@ -115,29 +123,45 @@ class TrainConfig:
         self.network.validate()
 
 
-TASKS = ("footstep",)
+@dataclass
+class ForwardTrainConfig(TrainConfig):
+    """Train the end-to-end baseline with PPO."""
+
+    task: str = "forward"
+    """What to learn: footstep (the low-level policy) or forward (the end-to-end baseline)."""
+    env: Annotated[ForwardConfig, tyro.conf.arg(name="")] = field(default_factory=ForwardConfig)
 
 
-def _paper() -> TrainConfig:
-    return TrainConfig(preset="paper", num_envs=4000, total_steps=300_000_000)
+TASKS: dict[str, type[TrainConfig]] = {"footstep": TrainConfig, "forward": ForwardTrainConfig}
+"""The config of each task."""
 
 
-def _cpu() -> TrainConfig:
+def _check_task(task: str) -> None:
+    if task not in TASKS:
+        raise InputError("--task", task, f"choose one of: {', '.join(TASKS)}")
+
+
+def _paper(task: str) -> TrainConfig:
+    return TASKS[task](preset="paper", num_envs=4000, total_steps=300_000_000)
+
+
+def _cpu(task: str) -> TrainConfig:
     """What learns fastest on a few cores: smaller updates, earlier ends of hopeless episodes, terrain by curriculum."""
-    config = TrainConfig(preset="cpu")
+    config = TASKS[task](preset="cpu")
     config.ppo = PPOConfig(horizon=24, epochs=3, minibatches=4, target_kl=0.015)
     config.network.initial_std = 0.25
     config.env.termination.max_steps = 1200
-    config.env.termination.stuck_seconds = 1.0
     config.env.termination.fall_height = 0.12
     config.env.termination.max_tilt = 60.0
     config.env.curriculum.enabled = True
+    if isinstance(config.env, FootstepConfig):
+        config.env.termination.stuck_seconds = 1.0
     return config
 
 
-def _smoke() -> TrainConfig:
+def _smoke(task: str) -> TrainConfig:
     """Seconds long: shows that everything runs."""
-    config = _cpu()
+    config = _cpu(task)
     config.preset, config.num_envs, config.total_steps, config.ppo.horizon = "smoke", 32, 4096, 16
     return config
 
@@ -149,15 +173,19 @@ def parse_command_line(default: TrainConfig | None = None, args: list[str] | Non
     """Read the command line over a preset's defaults, or over ``default``.
 
     Raises:
-        InputError: the preset is unknown.
+        InputError: the preset or the task is unknown, or a resumed run is of another task.
     """
     args = sys.argv[1:] if args is None else args
+    task = flag_value(args, "--task")
     if default is None:
         preset = flag_value(args, "--preset") or "cpu"
         if preset not in PRESETS:
             raise InputError("--preset", preset, f"choose one of: {', '.join(PRESETS)}")
-        default = PRESETS[preset]()
-    return tyro.cli(TrainConfig, default=default, args=args, prog="python -m quadhrl.trainers.ppo")
+        _check_task(task or "footstep")
+        default = PRESETS[preset](task or "footstep")
+    elif task is not None and task != default.task:
+        raise InputError("--task", task, f"this run's task is {default.task!r}; leave the flag out with --resume")
+    return tyro.cli(type(default), default=default, args=args, prog="python -m quadhrl.trainers.ppo")
 
 
 def flag_value(args: list[str], flag: str) -> str | None:
@@ -170,7 +198,17 @@ def flag_value(args: list[str], flag: str) -> str | None:
     return None
 
 
-def config_from_dict(values: dict[str, Any], cls: Any = TrainConfig, where: str = "config") -> Any:
+def train_config_from_dict(values: dict[str, Any], where: str = "config") -> TrainConfig:
+    """Rebuild a run's config, of whichever task, from its dictionary.
+
+    Raises:
+        InputError: the task or a field is unknown (the file is from another version).
+    """
+    _check_task(values.get("task", ""))
+    return config_from_dict(values, TASKS[values["task"]], where)
+
+
+def config_from_dict(values: dict[str, Any], cls: Any, where: str = "config") -> Any:
     """Rebuild a (nested) config dataclass from its dictionary.
 
     Raises:

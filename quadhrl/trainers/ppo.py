@@ -19,7 +19,7 @@ from torchrl.checkpoint import Checkpoint, GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.objectives import ClipPPOLoss
 
-from quadhrl.envs import FootstepEnv
+from quadhrl.envs import ENVIRONMENTS
 from quadhrl.envs.threads import one_thread_for_small_batches
 from quadhrl.errors import command_line
 from quadhrl.sim import Fault, resolve_device
@@ -50,7 +50,8 @@ class PPOTrainer:
         self.config = config
         self.device = resolve_device(config.device)
         torch.manual_seed(config.seed)
-        self.env = FootstepEnv(config.env, config.num_envs, engine=config.engine, device=self.device, seed=config.seed)
+        environment = ENVIRONMENTS[config.task]
+        self.env = environment(config.env, config.num_envs, engine=config.engine, device=self.device, seed=config.seed)
         if config.init_from:
             self.networks = load_networks(config.init_from, task=config.task, field="--init-from").networks.train()
         else:

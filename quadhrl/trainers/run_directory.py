@@ -15,7 +15,7 @@ from torchrl.record.loggers import get_logger
 
 from quadhrl.errors import InputError
 from quadhrl.trainers.checkpoint import metadata, rotation
-from quadhrl.trainers.config import TrainConfig, config_from_dict
+from quadhrl.trainers.config import TrainConfig, train_config_from_dict
 
 __all__ = ["RunDirectory", "read_run_config"]
 
@@ -86,7 +86,7 @@ def read_run_config(path: str) -> TrainConfig:
         values = json.loads(file.read_text())
     except (OSError, ValueError) as error:
         raise InputError("--resume", str(file), "the file is damaged; restore it") from error
-    return config_from_dict(values, where=f"--resume {file}")
+    return train_config_from_dict(values, where=f"--resume {file}")
 
 
 def _git_state() -> str:

@@ -12,8 +12,8 @@ NOMINAL = torch.tensor([[0.2134, 0.1494], [0.2135, -0.1493], [-0.2694, 0.1495], 
 
 
 def make(num_worlds=2000, **settings):
-    targets = FootstepTargets(TargetConfig(**settings), NOMINAL, num_worlds, torch.Generator().manual_seed(0))
-    targets.reset(torch.arange(num_worlds))
+    targets = FootstepTargets(TargetConfig(**settings), NOMINAL, num_worlds)
+    targets.reset(torch.arange(num_worlds), key=torch.arange(num_worlds))
     return targets
 
 
@@ -69,7 +69,7 @@ def test_partial_reset_leaves_other_worlds():
     targets = make(4)
     targets.advance(torch.ones(4, dtype=torch.bool))
     before = targets.position.clone()
-    targets.reset(torch.tensor([2]))
+    targets.reset(torch.tensor([2]), torch.tensor([77]))
     assert torch.equal(targets.position[[0, 1, 3]], before[[0, 1, 3]]) and targets.index.tolist() == [2, 2, 1, 2]
 
 

@@ -1,0 +1,214 @@
+"""Grid search over the targets of two pairs of feet: M_1 candidates for the next pair times M_2 for the following pair.
+
+The objective is ``V(i, j) + s_1(i) + s_2(j)``: only the value couples the pairs. Three searches find its largest entry:
+
+- `naive_search` passes every combination through the value function.
+- `exact_search` gives the same answer about nine times faster. Contributions to the first layer are added instead of computed
+  anew, ELU of a sum is taken from products of exponentials, and where the CPU multiplies bfloat16 natively, the table is first
+  computed in bfloat16 and only what may be its maximum again in float32.
+- `alternating_search` maximises over one pair with the other fixed, in turn, from several starts. It finds the same
+  maximum nearly always (``benchmarks/hlp.py`` measures how often) with a few per cent of the evaluations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from quadhrl.policies.goal_value import FactoredValue, GoalValue
+
+__all__ = ["SEARCHES", "PairCandidates", "Search", "alternating_search", "exact_search", "naive_search"]
+
+
+class PairCandidates(NamedTuple):
+    """The candidates of one pair, in N worlds."""
+
+    embedding: Tensor
+    """What they contribute to the goal [N, M, D]; see `GoalValue.embed`."""
+    score: Tensor
+    """Their score beside the value [N, M]."""
+
+
+Search = Callable[[GoalValue, PairCandidates, PairCandidates], tuple[Tensor, Tensor]]
+"""Takes the value and both pairs' candidates; gives the indices (i, j) of the best combination, [N] each."""
+
+MAX_ROWS = 16384
+"""Combinations whose hidden layers are held in memory at once, except by `naive_search`."""
+
+
+def naive_search(value: GoalValue, first: PairCandidates, second: PairCandidates) -> tuple[Tensor, Tensor]:
+    """All of a world's combinations through the value function at once: 2 GB for the paper's grid and critic."""
+    return _each_world(
+        value, first, second, lambda v, a, b: _best_of_table(v, a, b, max_rows=len(a.score[0]) * len(b.score[0]))
+    )
+
+
+def exact_search(value: GoalValue, first: PairCandidates, second: PairCandidates) -> tuple[Tensor, Tensor]:
+    """The same for less."""
+    screen = isinstance(value, FactoredValue) and len(value.rest) == 2 and first.score.device.type == "cpu"
+    screen = screen and torch.cpu._is_avx512_bf16_supported()  # it has no public name yet
+
+    def best(v: GoalValue, a: PairCandidates, b: PairCandidates) -> tuple[Tensor, Tensor]:
+        return (_screened(v, a, b) if screen else None) or _best_of_table(v, a, b)
+
+    return _each_world(value, first, second, best)
+
+
+def alternating_search(value: GoalValue, first: PairCandidates, second: PairCandidates) -> tuple[Tensor, Tensor]:
+    """Maximise over the first pair with the second fixed, then over the second, and so on until nothing changes.
+
+    Begins in every world with `STARTS` of the second pair's candidates, spread evenly over their list. Starts that arrive where
+    another has been are given up; the best of the others wins.
+    """
+    worlds, columns = second.score.shape
+    device = second.score.device
+    visited = torch.zeros(worlds, columns, dtype=torch.bool, device=device)
+    best = first.score.new_full((worlds,), -torch.inf)
+    best_i, best_j = torch.zeros(2, worlds, dtype=torch.long, device=device)
+    golden = (
+        torch.arange(min(STARTS, columns), device=device) * 0.6180339887 + 0.5
+    )  # fractional parts fill [0, 1) evenly
+    j = (golden % 1.0 * columns).long().unique()
+    w, j = torch.arange(worlds, device=device).repeat_interleave(len(j)), j.repeat(worlds)
+    while len(w):
+        visited[w, j] = True
+        _, i = _best_response(value, first, w, second.embedding[w, j])
+        objective, response = _best_response(value, second, w, first.embedding[w, i])
+        objective = objective + first.score[w, i]
+        best, best_i, best_j = _keep_best((best, best_i, best_j), w, objective, i, response)
+        on = ~visited[w, response]
+        key = (w[on] * columns + response[on]).unique()
+        w, j = key // columns, key % columns
+    return best_i, best_j
+
+
+SEARCHES: dict[str, Search] = {
+    "alternating": alternating_search,
+    "exact": exact_search,
+    "naive": naive_search,
+}
+"""The searches by name."""
+
+STARTS = 8
+"""Starts of the alternating search in each world."""
+
+
+def _values(value: GoalValue, a: Tensor, b: Tensor) -> Tensor:
+    """Values of all combinations of contributions a [N, A, D] and b [N, B, D], [N, A, B]."""
+    sums = (a[:, :, None] + b[:, None]).flatten(1, 2)
+    return value.value(sums).view(len(a), a.shape[1], b.shape[1])
+
+
+def _each_world(
+    value: GoalValue, first: PairCandidates, second: PairCandidates, search: Search
+) -> tuple[Tensor, Tensor]:
+    """Search one world at a time: a world's table is as much as the caches hold."""
+    found = []
+    for n in range(len(first.score)):
+        world = slice(n, n + 1)
+        found.append(search(value[world], *(PairCandidates(*(x[world] for x in pair)) for pair in (first, second))))
+    i, j = (torch.cat(indices) for indices in zip(*found, strict=True))
+    return i, j
+
+
+def _best_of_table(
+    value: GoalValue, first: PairCandidates, second: PairCandidates, max_rows: int = MAX_ROWS
+) -> tuple[Tensor, Tensor]:
+    """Indices of the largest entry of one world's table of objectives, computed a few rows at a time."""
+    rows, columns = first.score.shape[1], second.score.shape[1]
+    step = max(1, max_rows // columns)
+    best, index = first.score.new_full((1,), -torch.inf), torch.zeros(1, dtype=torch.long, device=first.score.device)
+    for start in range(0, rows, step):
+        part = slice(start, start + step)
+        table = _values(value, first.embedding[:, part], second.embedding)
+        top, where = (table + first.score[:, part, None] + second.score[:, None]).flatten(1).max(1)
+        index = torch.where(top > best, where + start * columns, index)
+        best = torch.maximum(best, top)
+    return index // columns, index % columns
+
+
+def _best_response(value: GoalValue, own: PairCandidates, worlds: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+    """Best of one pair's candidates in the worlds [K], each against a contribution ``other`` [K, D] of the other pair.
+
+    Returns:
+        Objectives, without the other pair's score, and indices, [K] each.
+    """
+    if len(worlds) == 1:  # the product of a single matrix rounds differently from that of several: see `FactoredValue`
+        objective, index = _best_response(value, own, worlds.repeat(2), other.repeat(2, 1))
+        return objective[:1], index[:1]
+    parts = -(-len(worlds) * own.score.shape[1] // MAX_ROWS)
+    found = []
+    for w, embedding in zip(worlds.tensor_split(parts), other.tensor_split(parts), strict=True):
+        table = value[w].value(own.embedding[w] + embedding[:, None]) + own.score[w]
+        found.append(table.max(1))
+    objective, index = (torch.cat(results) for results in zip(*found, strict=True))
+    return objective, index
+
+
+def _keep_best(
+    best: tuple[Tensor, Tensor, Tensor], worlds: Tensor, objective: Tensor, i: Tensor, j: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The better of each world's best so far (objective, i, j), [N] each, and its new points, [K] each."""
+    top = best[0].scatter_reduce(0, worlds, objective, "amax")
+    position = torch.arange(len(worlds), device=worlds.device)
+    wins = (objective == top[worlds]) & (objective > best[0][worlds])
+    first = torch.full_like(best[1], len(worlds)).scatter_reduce(
+        0, worlds[wins], position[wins], "amin"
+    )  # ties: the first
+    new = first < len(worlds)
+    chosen = first.clamp(max=len(worlds) - 1)
+    return top, torch.where(new, i[chosen], best[1]), torch.where(new, j[chosen], best[2])
+
+
+SCREENED = 4096
+"""Combinations that `exact_search` computes again in float32, at first."""
+
+
+def _screened(value: FactoredValue, first: PairCandidates, second: PairCandidates) -> tuple[Tensor, Tensor] | None:
+    """One world's best combination by way of a table in bfloat16; None where that cannot tell.
+
+    The largest difference between the tables is measured on the combinations computed again. A combination left out would have to be wrong by
+    `MARGIN` times as much to matter; where that is not excluded, the answer is None.
+    """
+    a, b = first.embedding[0], second.embedding[0]
+    # Both layers compute elu(x) + 1 = max(x + 1, exp(min(x, 0))); the biases take care of the ones.
+    exp_a, exp_b = (x.clamp(-40.0, 40.0).exp().bfloat16() for x in (a, b))
+    low_a, low_b = (a + 1.0).bfloat16(), b.bfloat16()
+    (weight, bias), (last_weight, last_bias) = value.rest
+    weight, bias = weight.bfloat16().contiguous(), (bias - weight.sum(0)).bfloat16()
+    last = last_weight.bfloat16()
+    table = a.new_empty(len(a), len(b))
+    hidden, negative = (low_a.new_empty(min(SCREEN_ROWS, len(a)), len(b), a.shape[1]) for _ in range(2))
+    for start in range(0, len(a), SCREEN_ROWS):
+        rows = slice(start, start + SCREEN_ROWS)
+        n = len(a[rows])
+        torch.add(low_a[rows, None], low_b, out=hidden[:n])
+        torch.mul(exp_a[rows, None], exp_b, out=negative[:n]).clamp_(max=1.0)
+        torch.maximum(hidden[:n], negative[:n], out=hidden[:n])
+        inputs, outputs = (x[:n].view(-1, a.shape[1]) for x in (hidden, negative))
+        torch.addmm(bias, inputs, weight, out=outputs)
+        torch.clamp(outputs, max=0.0, out=inputs).exp_()
+        torch.maximum(outputs.add_(1.0), inputs, out=outputs)
+        table[rows] = (outputs @ last).view(-1, len(b))
+    table += last_bias - last.float().sum()
+    table = table * value.scale[0] + value.scale[1]
+    table += first.score[0][:, None] + second.score[0]
+    flat = table.view(-1)
+    kept, where = flat.topk(min(SCREENED, len(flat)), sorted=False)
+    i, j = where // len(b), where % len(b)
+    exact = value.value((a[i] + b[j])[None])[0] + first.score[0][i] + second.score[0][j]
+    top, k = exact.max(0)
+    error = (exact - kept).abs().max()
+    if len(kept) < len(flat) and top < kept.min() + MARGIN * error:
+        return None
+    return i[k, None], j[k, None]
+
+
+SCREEN_ROWS = 12
+"""First-pair candidates per step of the screening: few enough for the caches, enough for two threads."""
+
+MARGIN = 2.0
+"""How many times larger than the largest error seen an error may be without harm."""
