@@ -1,8 +1,9 @@
 """Time of one solve of the high-level policy's grid search, each search in the same run on the same recorded states.
 
 ``python benchmarks/hlp.py [--json]`` prints one object ``{"solves": [{"worlds", "device", "naive_ms", "exact_ms",
-"alternating_ms", "agreement", "worst_gap"}]}``: milliseconds per solve and world; the share of states where the alternating search
-finds the maximum that the exact one finds; and by how much its objective falls short in the worst state, in reward units.
+"alternating_ms", "agreement", "worst_gap"}]}``: milliseconds per solve and world; the share of states where the alternating
+search finds the maximum that the exact one finds; and by how much its objective falls short in the worst state, in reward
+units.
 The states are those of a robot that walks over the training terrain with the high-level policy.
 """
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -98,7 +98,7 @@ class LocomotionEnv(EnvBase):
     batch_locked = True
     reward_names: tuple[str, ...]
     """Names of the task's reward terms."""
-    network_inputs: dict[str, int]
+    network_inputs: ClassVar[dict[str, int]]
     """Observation keys that policy and value function see, and their sizes, in input order."""
 
     def __init__(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -86,7 +86,7 @@ class FootstepEnv(LocomotionEnv):
     """
 
     config: FootstepConfig
-    network_inputs = {"proprioception": 80, "goal": 12, "scan": 4 * SCAN_POINTS}
+    network_inputs: ClassVar[dict[str, int]] = {"proprioception": 80, "goal": 12, "scan": 4 * SCAN_POINTS}
     reward_names = (
         "footstep_target",
         "velocity_towards_target",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -59,7 +59,7 @@ class ForwardEnv(LocomotionEnv):
     """
 
     config: ForwardConfig
-    network_inputs = {"proprioception": 77, "scan": 4 * SCAN_POINTS}
+    network_inputs: ClassVar[dict[str, int]] = {"proprioception": 77, "scan": 4 * SCAN_POINTS}
     reward_names = ("forward_velocity", "lateral_velocity", "smoothness", "foot_slip", "collision", "swing_phase")
 
     def _set_up_task(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +11,12 @@ from typing import Annotated
 import torch
 import tyro
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from quadhrl.envs import FootstepConfig, FootstepEnv
-from quadhrl.envs.footstep import FootstepTerminationConfig
+from quadhrl.envs import ENVIRONMENTS, FootstepConfig, LocomotionEnv
 from quadhrl.errors import InputError, command_line
+from quadhrl.policies import HighLevelConfig, HighLevelPolicy
 from quadhrl.sim import resolve_device
 from quadhrl.trainers.checkpoint import load_networks
 from quadhrl.trainers.statistics import rollout_statistics
@@ -30,6 +32,10 @@ class PlayConfig:
     """Checkpoint file or run directory."""
     policy: str = "checkpoint"
     """Who acts: checkpoint (the default, deterministic), zero or random."""
+    hlp: bool = False
+    """Let the high-level policy choose the targets (for a footstep policy): the robot walks along --heading."""
+    heading: float = 0.0
+    """Direction of travel in the world with --hlp, 0 along x [degrees]."""
     video: str = ""
     """Write a film of the first world to this file (.mp4)."""
     picture: str = ""
@@ -78,16 +84,22 @@ def play(config: PlayConfig) -> dict[str, float]:
     torch.manual_seed(config.seed)
     device = resolve_device(config.device)
     if config.policy == "checkpoint":
-        loaded = load_networks(config.checkpoint, task="footstep", device=device, field="CHECKPOINT")
-        env_config, policy = loaded.config.env, loaded.networks.policy()
+        loaded = load_networks(config.checkpoint, device=device, field="CHECKPOINT")
+        task, env_config, policy = loaded.config.task, loaded.config.env, loaded.networks.policy()
     else:
-        env_config, policy = FootstepConfig(), None
+        task, env_config, policy = "footstep", FootstepConfig(), None
     env_config.curriculum.enabled = False
-    env_config.termination = FootstepTerminationConfig()  # the paper's, whatever training used
+    env_config.termination = type(env_config.termination)()  # the paper's, whatever training used
     for name in ("infill", "height_range"):
         if getattr(config, name) is not None:
             setattr(env_config.terrain, name, getattr(config, name))
-    env = FootstepEnv(env_config, config.num_envs, engine=config.engine, device=device, seed=config.seed)
+    if config.hlp:
+        if policy is None or not isinstance(env_config, FootstepConfig):
+            raise InputError("--hlp", True, "the high-level policy needs the checkpoint of a footstep policy; give one")
+        env_config.targets.max_step = env_config.targets.max_shift = 0.0  # until it begins to choose
+        settings = HighLevelConfig(heading=math.radians(config.heading))
+        policy = TensorDictSequential(HighLevelPolicy(loaded.networks.value(), settings), policy)
+    env = ENVIRONMENTS[task](env_config, config.num_envs, engine=config.engine, device=device, seed=config.seed)
 
     def act(td):
         if policy is not None:
@@ -104,7 +116,7 @@ def play(config: PlayConfig) -> dict[str, float]:
         watchers.append(WebViewer(env))
         print(watchers[-1].url)
 
-    def watch(_env: FootstepEnv, _td: TensorDictBase) -> None:
+    def watch(_env: LocomotionEnv, _td: TensorDictBase) -> None:
         for watcher in watchers:
             watcher.show()
 
@@ -123,7 +135,7 @@ def play(config: PlayConfig) -> dict[str, float]:
 
 
 class _Film:
-    def __init__(self, config: PlayConfig, env: FootstepEnv) -> None:
+    def __init__(self, config: PlayConfig, env: LocomotionEnv) -> None:
         from quadhrl.eval.rendering import WorldRenderer
 
         self._config, self._steps = config, 0

@@ -7,7 +7,7 @@ import os
 import mujoco
 import numpy as np
 
-from quadhrl.envs import FootstepEnv
+from quadhrl.envs import LocomotionEnv
 from quadhrl.errors import InputError
 from quadhrl.eval.world_view import Disc, WorldView
 
@@ -27,7 +27,7 @@ class WorldRenderer:
         InputError: no headless OpenGL can be had.
     """
 
-    def __init__(self, env: FootstepEnv, world: int = 0, *, width: int = 960, height: int = 540) -> None:
+    def __init__(self, env: LocomotionEnv, world: int = 0, *, width: int = 960, height: int = 540) -> None:
         self.view = WorldView(env, world)
         visual = self.view.model.vis
         visual.global_.offwidth, visual.global_.offheight = width, height

@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from quadhrl.envs import FootstepEnv
+from quadhrl.envs import LocomotionEnv
 from quadhrl.errors import InputError
 from quadhrl.eval.world_view import WorldView
 
@@ -27,7 +27,7 @@ class WebViewer:
         InputError: the viewer extra is not installed.
     """
 
-    def __init__(self, env: FootstepEnv, world: int = 0, *, port: int = 8080) -> None:
+    def __init__(self, env: LocomotionEnv, world: int = 0, *, port: int = 8080) -> None:
         try:
             import viser
         except ImportError as error:

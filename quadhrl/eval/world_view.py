@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import torch
 
-from quadhrl.envs import FootstepEnv
+from quadhrl.envs import FootstepEnv, LocomotionEnv
 from quadhrl.robots import get_robot
 from quadhrl.sim import build_scene
 
@@ -38,14 +38,14 @@ class WorldView:
     WINDOW = 30
     """Blocks along each side of the terrain that is shown."""
 
-    def __init__(self, env: FootstepEnv, world: int) -> None:
+    def __init__(self, env: LocomotionEnv, world: int) -> None:
         self.env, self.world = env, world
         self.scene = build_scene(
             get_robot(env.config.robot), env.config.terrain, env.config.physics, window=self.WINDOW, visuals=True
         )
         self.model = self.scene.model
         self.data = mujoco.MjData(self.model)
-        self.disc_radius = env.config.rewards.hit_radius
+        self.disc_radius = env.config.rewards.hit_radius if isinstance(env, FootstepEnv) else 0.0
         """Radius within which a foot hits its target [m]."""
 
     def update(self) -> None:
@@ -56,7 +56,9 @@ class WorldView:
         mujoco.mj_comPos(self.model, self.data)
 
     def discs(self) -> list[Disc]:
-        """The present footstep targets, on the ground."""
+        """The present footstep targets, on the ground; none in a task without targets."""
+        if not isinstance(self.env, FootstepEnv):
+            return []
         targets = self.env.targets
         on = targets.active[self.world].tolist()
         colours = [_ACTIVE if active else _STANCE for active in on] + [_FOLLOWING] * 2

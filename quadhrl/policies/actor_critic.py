@@ -66,13 +66,18 @@ class _Gaussian(nn.Module):
 
 
 class Denormalize(nn.Module):
-    """Value in reward units from the critic's normalised one."""
+    """Value in reward units from the critic's normalised one.
+
+    Args:
+        statistics: mean and standard deviation of the values.
+    """
 
     def __init__(self, statistics: RunningStatistics) -> None:
         super().__init__()
         self.statistics = statistics
 
     def forward(self, value: Tensor) -> Tensor:
+        """Values [..., 1] in reward units."""
         return value * self.statistics.std + self.statistics.mean
 
 

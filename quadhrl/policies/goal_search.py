@@ -170,8 +170,8 @@ SCREENED = 4096
 def _screened(value: FactoredValue, first: PairCandidates, second: PairCandidates) -> tuple[Tensor, Tensor] | None:
     """One world's best combination by way of a table in bfloat16; None where that cannot tell.
 
-    The largest difference between the tables is measured on the combinations computed again. A combination left out would have to be wrong by
-    `MARGIN` times as much to matter; where that is not excluded, the answer is None.
+    The largest difference between the tables is measured on the combinations computed again. One left out would have to be
+    wrong by `MARGIN` times as much to matter; where that is not excluded, the answer is None.
     """
     a, b = first.embedding[0], second.embedding[0]
     # Both layers compute elu(x) + 1 = max(x + 1, exp(min(x, 0))); the biases take care of the ones.

@@ -69,6 +69,7 @@ class ModuleValue(GoalValue):
         return zeros.scatter(2, columns[:, None].expand(-1, flat.shape[1], -1), flat)
 
     def value(self, embedding: Tensor) -> Tensor:
+        """The module's values of the goals [N, K, 12], every world's observation repeated K times."""
         goal = embedding + self._fixed[:, None]
         batch = self._observation[:, None].expand(goal.shape[:2]).reshape(-1)
         batch["goal"] = goal.flatten(0, 1)
@@ -124,6 +125,7 @@ class FactoredValue(GoalValue):
         return sums
 
     def value(self, embedding: Tensor) -> Tensor:
+        """The rest of the critic on first-layer sums [N, K, H]."""
         n = len(embedding)
         hidden = functional.elu(embedding)
         for weight, bias in self.rest[:-1]:

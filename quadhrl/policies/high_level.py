@@ -156,7 +156,8 @@ class GridProblem:
         parity = tensordict["pair"][:, 0] % 2
         feet = policy.pairs[torch.stack([parity, 1 - parity], 1)]  # [N, 2, 2]
         index = feet.flatten(1)[..., None].expand(-1, -1, 2)
-        self._feet, self._centre = (tensordict[key].gather(1, index).view(-1, 2, 2, 2) for key in ("feet", "footholds"))
+        self._feet, self.centre = (tensordict[key].gather(1, index).view(-1, 2, 2, 2) for key in ("feet", "footholds"))
+        """``centre``: the middle of each foot's box, the target that it hit last, m."""
         self._yaw = tensordict["yaw"][:, 0]
         xy = torch.arange(2, device=feet.device)
         following = torch.arange(8, 12, device=feet.device).expand(len(feet), -1)
@@ -180,28 +181,34 @@ class GridProblem:
 
     def search(self) -> Tensor:
         """The grid's best targets."""
-        grids = [self._centre[:, None, k] + self._policy.offsets(bool(k)) for k in (0, 1)]
+        grids = [self.centre[:, None, k] + self._policy.offsets(bool(k)) for k in (0, 1)]
         best = SEARCHES[self._policy.config.search](self._value, *(self._candidates(grids[k], k) for k in (0, 1)))
         worlds = torch.arange(len(self._goal), device=self._goal.device)
         return torch.stack([grid[worlds, k] for grid, k in zip(grids, best, strict=True)], 1)
 
-    def ascend(self, targets: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient ascent from ``targets``, in each world by itself: the best point on its way and its objective [N]."""
+    def ascent(self, targets: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Gradient ascent from ``targets``, in each world by itself: the points on its way and their objectives [N]."""
         config, half_width = self._policy.config, self._policy.half_width[:, None]
-        low, high = self._centre - half_width, self._centre + half_width
-        best, best_objective = targets, self._goal.new_full((len(targets),), -torch.inf)
-        for k in range(config.ascent_steps + 1):
+        low, high = self.centre - half_width, self.centre + half_width
+        points = []
+        for _ in range(config.ascent_steps + 1):
             with torch.enable_grad():
                 variable = targets.detach().requires_grad_()
                 objective = self.objective(variable)
                 (gradient,) = torch.autograd.grad(objective.sum(), variable)
-            better = objective.detach() > best_objective
-            best_objective = torch.where(better, objective.detach(), best_objective)
-            best = torch.where(better[:, None, None, None], targets, best)
-            if k < config.ascent_steps:
-                targets = targets + config.ascent_rate * gradient * (half_width > 0.0)
-                if config.confine:
-                    targets = targets.clamp(low, high)
+            points.append((targets, objective.detach()))
+            targets = targets + config.ascent_rate * gradient * (half_width > 0.0)
+            if config.confine:
+                targets = targets.clamp(low, high)
+        return points
+
+    def ascend(self, targets: Tensor) -> tuple[Tensor, Tensor]:
+        """The best point of the `ascent` from ``targets`` and its objective [N]: never worse than where it began."""
+        best, best_objective = targets, self._goal.new_full((len(targets),), -torch.inf)
+        for point, objective in self.ascent(targets):
+            better = objective > best_objective
+            best = torch.where(better[:, None, None, None], point, best)
+            best_objective = torch.maximum(objective, best_objective)
         return best, best_objective
 
     def objective(self, targets: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from quadhrl.envs import ENVIRONMENTS
 from quadhrl.envs.threads import one_thread_for_small_batches
-from quadhrl.errors import command_line
+from quadhrl.errors import InputError, command_line
 from quadhrl.sim import Fault, resolve_device
 from quadhrl.trainers.advantage import add_advantages
 from quadhrl.trainers.checkpoint import build_networks, find_checkpoint, load_networks, read_metadata
@@ -44,6 +44,8 @@ class PPOTrainer:
     Raises:
         InputError: a setting is out of its range.
     """
+
+    RECENT = 16
 
     def __init__(self, config: TrainConfig) -> None:
         config.validate()
@@ -82,6 +84,10 @@ class PPOTrainer:
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=ppo.learning_rate, eps=1e-8, fused=True)
         self.samples = 0
         """Samples trained on so far."""
+        self.recent_rewards: list[float] = []
+        """Reward per control step of the last updates, at most `RECENT` of them."""
+        self.max_reward = -math.inf
+        """Largest mean of `recent_rewards` so far, once there are `RECENT`."""
         self.wall_seconds = 0.0
         """Time spent in `iterate` so far, over all resumes [s]."""
 
@@ -97,6 +103,9 @@ class PPOTrainer:
         # Only now: the update must see the same features as the collection did, or its ratios would not begin at 1.
         self._update_normalizer(batch)
         self.samples += batch.numel()
+        self.recent_rewards = [*self.recent_rewards[1 - self.RECENT :], scalars["rollout/reward"]]
+        if len(self.recent_rewards) == self.RECENT:
+            self.max_reward = max(self.max_reward, sum(self.recent_rewards) / self.RECENT)
         ended = time.perf_counter()
         self.wall_seconds += ended - began
         scalars |= {
@@ -172,15 +181,29 @@ class PPOTrainer:
 
     def state_dict(self) -> dict[str, Any]:
         """The run's position, beside what has a state of its own."""
-        return {"samples": self.samples, "wall_seconds": self.wall_seconds}
+        return {
+            "samples": self.samples,
+            "wall_seconds": self.wall_seconds,
+            "recent_rewards": self.recent_rewards,
+            "max_reward": self.max_reward,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the run's position."""
         self.samples, self.wall_seconds = int(state["samples"]), float(state["wall_seconds"])
+        self.recent_rewards, self.max_reward = list(state["recent_rewards"]), float(state["max_reward"])
 
     def load(self, path: Any) -> None:
-        """Carry on exactly where the checkpoint was saved."""
-        self.checkpoint().load(path, map_location=self.device)
+        """Carry on exactly where the checkpoint was saved.
+
+        Raises:
+            InputError: its environment's state is of another version.
+        """
+        try:
+            self.checkpoint().load(path, map_location=self.device)
+        except KeyError as error:
+            remedy = "an earlier version wrote its environment's state; start a new run with --init-from"
+            raise InputError("--resume", str(path), remedy) from error
         self.collector.reset(keep_state=True)
 
     def _adapt_learning_rate(self, kl: float) -> None:
@@ -231,7 +254,8 @@ def train(config: TrainConfig) -> None:
     latest = {"reward": -math.inf}
 
     def save() -> None:
-        directory.save(checkpoint, trainer.samples, wall_seconds=trainer.wall_seconds, **latest)
+        facts = latest | ({"max_reward": trainer.max_reward} if math.isfinite(trainer.max_reward) else {})
+        directory.save(checkpoint, trainer.samples, wall_seconds=trainer.wall_seconds, **facts)
 
     checkpoint = trainer.checkpoint()
     began = last_save = time.monotonic()

@@ -1,0 +1,56 @@
+"""The comparison as one self-contained page: pictures inside, nothing loaded from anywhere."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jinja2
+
+from quadhrl.eval.charts import CHARTS
+from quadhrl.eval.methods import METHODS
+from quadhrl.eval.summary import CLAIMS, Summary
+from quadhrl.eval.terrains import PUBLISHED, PUBLISHED_CLAIMS
+
+if TYPE_CHECKING:
+    from quadhrl.eval.grid import GridConfig
+
+__all__ = ["write_report"]
+
+
+def write_report(
+    folder: Path,
+    config: GridConfig,
+    summary: Summary,
+    variants: dict[str, Summary],
+    facts: dict[str, Any],
+    run: dict[str, Any],
+) -> Path:
+    """Write ``report.html`` into the results folder from its pictures and figures; returns its path.
+
+    Args:
+        folder: the results folder, with the pictures in it.
+        config: the comparison's settings.
+        summary: its results.
+        variants: its results counted in other ways, by name.
+        facts: rewards in training and the like.
+        run: duration and memory.
+    """
+    titles = {name: title for name, (_, title) in CHARTS.items()} | {"landscape": "what the high-level policy sees"}
+    pictures = {
+        name: "data:image/png;base64," + base64.b64encode(file.read_bytes()).decode()
+        for name in titles
+        if (file := folder / f"{name}.png").exists()
+    }
+    loader = jinja2.PackageLoader("quadhrl.eval", ".")
+    template = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True).get_template(
+        "report.html.j2"
+    )
+    page = template.render(
+        config=config, summary=summary, variants=variants, facts=facts, run=run, pictures=pictures, titles=titles,
+        methods=METHODS, claims=CLAIMS, published=PUBLISHED, published_claims=PUBLISHED_CLAIMS,
+    )  # fmt: skip
+    path = folder / "report.html"
+    path.write_text(page)
+    return path
