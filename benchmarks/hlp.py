@@ -62,7 +62,7 @@ def record_states(networks: ActorCritic, count: int, device: torch.device) -> Te
 
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         env.rollout(80 + count // 5, policy=policy, break_when_any_done=False, callback=record)
-    states = torch.cat(seen)
+    states: TensorDictBase = torch.cat(seen)  # type: ignore[assignment]
     return states[torch.randperm(len(states), generator=torch.Generator().manual_seed(0))[:count]]
 
 

@@ -75,7 +75,7 @@ def mean_action(networks: ActorCritic, tensordict: TensorDictBase) -> Tensor:
     last bit decides where a robot is ten seconds later.
     """
     hidden = networks.normalizer.module(*(tensordict[key] for key in networks.observations))[:, None]
-    for layer in networks.actor[0].module.mlp:
+    for layer in networks.actor[0].module.mlp.children():
         if isinstance(layer, nn.Linear):
             hidden = torch.bmm(hidden, layer.weight.T.expand(len(hidden), -1, -1)) + layer.bias
         else:

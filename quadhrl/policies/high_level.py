@@ -124,9 +124,8 @@ class HighLevelPolicy(TensorDictModuleBase):
         """What `forward` writes, for some of the worlds."""
         problem = GridProblem(self, tensordict[worlds], worlds)
         targets, objective = problem.ascend(problem.search())
-        started = (tensordict["pair"][worlds] >= self.config.start_pair) & (
-            tensordict["events", "step_count"][worlds] >= self.config.start_step
-        )
+        steps: Tensor = tensordict["events", "step_count"][worlds]
+        started = (tensordict["pair"][worlds] >= self.config.start_pair) & (steps >= self.config.start_step)
         goal = torch.where(started, problem.goal(targets), tensordict["goal"][worlds])
         return goal, torch.where(started[..., None, None], targets, problem.observed_targets), objective[:, None]
 
@@ -179,6 +178,7 @@ class GridProblem:
         vectors = torch.stack([self._see(targets[:, None, k], k).vector[:, 0] for k in (0, 1)], 1)
         return self._goal.scatter(1, self._entries.flatten(1), vectors.flatten(1))
 
+    @torch.no_grad()
     def search(self) -> Tensor:
         """The grid's best targets."""
         grids = [self.centre[:, None, k] + self._policy.offsets(bool(k)) for k in (0, 1)]
@@ -204,7 +204,7 @@ class GridProblem:
 
     def ascend(self, targets: Tensor) -> tuple[Tensor, Tensor]:
         """The best point of the `ascent` from ``targets`` and its objective [N]: never worse than where it began."""
-        best, best_objective = targets, self._goal.new_full((len(targets),), -torch.inf)
+        best, best_objective = targets, torch.full_like(self._yaw, -torch.inf)
         for point, objective in self.ascent(targets):
             better = objective > best_objective
             best = torch.where(better[:, None, None, None], point, best)

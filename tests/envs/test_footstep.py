@@ -228,3 +228,77 @@ def test_curriculum_moves_levels_by_score_and_not_on_the_first_reset():
     assert env.curriculum.level.tolist() == pytest.approx([0.2, 0.0, 0.0, 0.0])
     assert env.terrain.infill.tolist() == pytest.approx([0.98, 1, 1, 1])
     assert env.terrain.height_range.tolist() == pytest.approx([0.01, 0, 0, 0])
+
+
+def test_the_environment_adopts_the_targets_of_a_rewritten_goal():
+    env = make_env(3)
+    td = env.reset()
+    for _ in range(12):
+        td = env.step(td.set("action", torch.zeros(3, 15)))["next"]
+    position, following = env.targets.position.clone(), env.targets.following.clone()
+    yaw = float(td["yaw"][1])
+    wish = torch.tensor([0.31, -0.12])  # in the world, for FR of world 1; and the first following target of world 2
+    goal = td["goal"].clone()
+    offset = wish - td["feet"][1, 1]
+    turn = torch.tensor([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]], dtype=torch.float32)
+    goal[1, 2:4] = turn @ offset
+    goal[2, 8] += 0.05
+    after = env.step(td.set("goal", goal).set("action", torch.zeros(3, 15)))["next"]
+    assert torch.allclose(env.targets.position[1, 1], wish, atol=1e-6)
+    assert not torch.equal(env.targets.following[2, 0], following[2, 0])
+    untouched = torch.ones(3, 4, dtype=torch.bool)
+    untouched[1, 1] = False
+    assert torch.equal(env.targets.position[untouched], position[untouched]), "bit by bit"
+    assert torch.equal(env.targets.following[:2], following[:2]) and torch.equal(env.targets.following[2, 1], following[2, 1])
+    yaw = float(after["yaw"][1])
+    turn = torch.tensor([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]], dtype=torch.float32)
+    assert torch.allclose(after["goal"][1, 2:4], turn @ (wish - after["feet"][1, 1]), atol=1e-6)
+
+
+def test_goals_written_in_place_or_not_finite():
+    env, twin = make_env(2), make_env(2)
+    td, same = env.reset(), twin.reset()
+    for _ in range(3):
+        td = env.step(td.set("action", torch.zeros(2, 15)))["next"]
+        same = twin.step(same.set("action", torch.zeros(2, 15)))["next"]
+    td["goal"][0, 2] += 0.1
+    td["goal"][1, 2] = float("nan")
+    position = env.targets.position.clone()
+    env.step(td.set("action", torch.zeros(2, 15)))
+    moved = (env.targets.position - position).norm(dim=-1)
+    assert moved[0, 1] == pytest.approx(0.1, abs=1e-6) and moved.sum() == moved[0, 1], "written in place counts, NaN does not"
+    assert torch.isfinite(env.targets.position).all()
+
+
+def test_footholds_are_the_targets_hit_last():
+    env = make_env(2, targets__max_step=0.02, targets__max_shift=0.04)
+    generator = torch.Generator().manual_seed(0)
+    td = env.reset()
+    expected = env.targets.position.clone()
+    expected[:] = env.nominal_feet
+    for _ in range(60):
+        position = env.targets.position.clone()
+        td = env.step(td.set("action", trot(env, generator)))["next"]
+        for w in range(2):
+            if bool(td["events", "pair_hit"][w]):
+                expected[w] = position[w]
+        assert torch.equal(td["footholds"], expected)
+    assert int(td["pair"].min()) > 2
+
+
+def test_a_world_has_the_same_terrain_and_targets_in_any_batch():
+    """Terrain, targets and, on the native engine, the whole course follow from the seed and the world's number."""
+    big, small = make_env(64), make_env(32)
+    numbers = torch.arange(40, 72)
+    small.terrain.assign(numbers, torch.full((32,), 0.9), torch.full((32,), 0.05))
+    big.terrain.assign(torch.arange(8, 72), torch.full((64,), 0.9), torch.full((64,), 0.05))
+    courses = []
+    for env, part in ((big, slice(32, 64)), (small, slice(0, 32))):
+        env.set_seed(4)
+        td = env.reset()
+        courses.append([])
+        for k in range(80):
+            action = torch.sin(torch.arange(15) * 1.7 + 0.3 * k).expand(env.num_envs, -1) * 0.4
+            td = env.step(td.set("action", action))["next"]
+            courses[-1].append(torch.cat([td["goal"], td["scan"], td["proprioception"]], -1)[part])
+    assert torch.equal(torch.stack(courses[0]), torch.stack(courses[1]))

@@ -1,0 +1,66 @@
+"""What the high-level policy makes robots do on level ground, with the shipped low-level policy and with a scripted one."""
+
+import math
+
+import pytest
+import torch
+from states import make_env, trained_networks, walk
+
+from quadhrl.policies import HighLevelConfig, HighLevelPolicy
+
+
+@pytest.fixture(scope="module")
+def networks():
+    return trained_networks()
+
+
+def strides(env, hlp, networks, steps):
+    """Displacements of the next pair's chosen targets from the same feet's last ones, from step 70 on [T, N, 2, 2]."""
+    seen = []
+
+    def note(_env, td):
+        if int(td["events", "step_count"][0]) >= 70:
+            pair = hlp.pairs[td["pair"][:, 0] % 2]
+            last = td["footholds"].gather(1, pair[..., None].expand(-1, -1, 2))
+            seen.append(td["targets"][:, 0] - last)
+
+    rollout = walk(env, steps, networks, hlp, note)
+    return torch.stack(seen), rollout
+
+
+def test_it_walks_forward_with_strides_at_the_grids_edge(networks):
+    env = make_env(2, infill=1.0, height_range=0.0)
+    hlp = HighLevelPolicy(networks.value())
+    chosen, rollout = strides(env, hlp, networks, 260)
+    assert chosen[..., 0].median().item() == pytest.approx(0.15, abs=0.01)  # the authors' median: 0.157 m
+    assert not rollout["next", "done"].any()
+    speed = env.sim.readings.base_position[:, 0] / (260 / 60)
+    assert (speed > 0.2).all(), speed
+
+
+def test_without_the_directional_term_it_stays_in_place(networks):
+    env = make_env(2, infill=1.0, height_range=0.0)
+    walk(env, 260, networks, HighLevelPolicy(networks.value(), HighLevelConfig(direction_weight=0.0)))
+    with_direction = 0.2 * 260 / 60
+    assert (env.sim.readings.base_position[:, :2].norm(dim=-1) < 0.6 * with_direction).all()
+
+
+def test_it_walks_sideways_and_turns_when_the_heading_changes(networks):
+    """Two worlds with headings of their own, exchanged in mid-run."""
+    env = make_env(2, infill=1.0, height_range=0.0)
+    hlp = HighLevelPolicy(networks.value())
+    hlp.direction.heading = torch.tensor([math.pi / 2, 0.0])
+    halfway = []
+
+    def turn(_env, td):
+        if int(td["events", "step_count"][0]) == 250:
+            halfway.append(env.sim.readings.base_position[:, :2].clone())
+            hlp.direction.heading = torch.tensor([0.0, math.pi / 2])
+
+    walk(env, 460, networks, hlp, turn)
+    first = halfway[0]
+    second = env.sim.readings.base_position[:, :2] - first
+    assert first[0, 1] > 0.25 and first[0, 1] > first[0, 0].abs(), "mostly to the left"
+    assert first[1, 0] > 0.6
+    assert second[0, 0] > 0.6 and second[0, 0] > second[0, 1].abs(), "now forward"
+    assert second[1, 1] > 0.15 and second[1, 1] > second[1, 0].abs(), "now to the left"
