@@ -22,7 +22,7 @@ from quadhrl.eval.landscape import draw_landscape
 from quadhrl.eval.methods import METHODS, make_method
 from quadhrl.eval.report import write_report
 from quadhrl.eval.results import ResultsFolder
-from quadhrl.eval.rollouts import Job, StopRules, run_episodes
+from quadhrl.eval.rollouts import Episode, Job, StopRules, run_episodes
 from quadhrl.eval.summary import Normalizer, Summary, bootstrap_mean, published_json, summarize
 from quadhrl.eval.terrains import TestTerrain
 from quadhrl.policies import HighLevelConfig
@@ -119,10 +119,11 @@ def run_grid(config: GridConfig) -> Path:
     folder.sort()
 
     normalizers = _normalizers(folder, policies)
-    summary = summarize(folder.episodes, normalizers)
+    episodes = [e for e in folder.episodes if _asked_for(e, config)]  # the folder may hold more
+    summary = summarize(episodes, normalizers)
     variants = {
-        "authors_rules": summarize(folder.episodes, normalizers, until_stuck=True),
-        "by_training_maximum": summarize(folder.episodes, normalizers, by_training=True),
+        "authors_rules": summarize(episodes, normalizers, until_stuck=True),
+        "by_training_maximum": summarize(episodes, normalizers, by_training=True),
     }
     draw_charts(summary, folder.path)
     if "hlp" in config.methods:
@@ -136,6 +137,11 @@ def run_grid(config: GridConfig) -> Path:
     facts = _facts(config, folder, policies, normalizers)
     _write_summary(folder.path / "summary.json", summary, variants, facts | {"run": run})
     return write_report(folder.path, config, summary, variants, facts, run)
+
+
+def _asked_for(episode: Episode, config: GridConfig) -> bool:
+    terrain = episode.infill in config.infill and episode.height_range in config.height_range
+    return terrain and episode.method in config.methods and episode.rollout < config.rollouts
 
 
 def _load(config: GridConfig) -> dict[str, LoadedPolicy]:

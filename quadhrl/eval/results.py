@@ -23,7 +23,8 @@ class ResultsFolder:
 
     Args:
         path: the folder.
-        configuration: what all of its rollouts have in common, as JSON-like values; written to ``configuration.json``.
+        configuration: what all of its rollouts have in common, as JSON-like values; written to ``configuration.json``. What
+            the folder's own does not mention yet is added to it.
 
     Raises:
         InputError: it holds results of another configuration, or something else, or it cannot be written.
@@ -32,15 +33,15 @@ class ResultsFolder:
     def __init__(self, path: Path, configuration: dict[str, Any]) -> None:
         self.path, self._file = path, path / "episodes.csv"
         settings = path / "configuration.json"
-        text = json.dumps(configuration, indent=2) + "\n"
         try:
             if settings.exists():
-                _check_same(path, json.loads(settings.read_text()), json.loads(text))
+                found = json.loads(settings.read_text())
+                _check_same(path, found, json.loads(json.dumps(configuration)))
+                configuration = found | configuration
             elif path.exists() and (not path.is_dir() or any(path.iterdir())):
                 raise InputError("--out", str(path), "it holds something else; choose a new folder")
             path.mkdir(parents=True, exist_ok=True)
-            if not settings.exists():
-                settings.write_text(text)
+            settings.write_text(json.dumps(configuration, indent=2) + "\n")
         except ValueError as error:
             if isinstance(error, InputError):
                 raise
@@ -107,9 +108,7 @@ class ResultsFolder:
 
 
 def _check_same(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    for name in {**found, **wanted}:
-        if found.get(name) != wanted.get(name):
-            remedy = (
-                f"it holds results with {name} = {found.get(name)!r}, not {wanted.get(name)!r}; choose a new folder"
-            )
+    for name in found.keys() & wanted.keys():
+        if found[name] != wanted[name]:
+            remedy = f"it holds results with {name} = {found[name]!r}, not {wanted[name]!r}; choose a new folder"
             raise InputError("--out", str(path), remedy)
