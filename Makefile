@@ -3,15 +3,19 @@ PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo/$(shell date +%Y-%m-%d_%H-%M-%S)
 
-.PHONY: demo test lint format type bench
+.PHONY: demo train test lint format type bench
 
 .venv/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch .venv/ready
 
-## Train the footstep policy on level ground for a few minutes, plot its learning curve and film it.
+## The paper's comparison in small: 2 rollouts of up to 2000 steps per method and terrain; prints the report's path.
 demo: .venv/ready
+	$(BIN)/python -m quadhrl.eval.grid --rollouts 2 --rules.max-steps 2000 --rules.end-when-stuck --out $(DEMO)
+
+## Train the footstep policy on level ground for a few minutes, plot its learning curve and film it.
+train: .venv/ready
 	$(BIN)/python -m quadhrl.trainers.ppo --preset cpu --infill 1 --height-range 0 --total-steps 8000000 \
 		--max-minutes 9 --log-dir $(dir $(DEMO)) --run-name $(notdir $(DEMO))
 	$(BIN)/python -m quadhrl.eval.curves $(DEMO) --out $(DEMO)/curves.png
@@ -33,3 +37,4 @@ type: .venv/ready
 
 bench: .venv/ready
 	$(BIN)/python benchmarks/throughput.py
+	$(BIN)/python benchmarks/hlp.py

@@ -7,7 +7,7 @@ from quadhrl.hashing import hash_key, hash_uniform
 
 def test_numbers_are_uniform_and_uncorrelated():
     numbers = hash_uniform(hash_key(3, torch.arange(2000)), 50)
-    assert 0.0 <= numbers.min() and numbers.max() < 1.0
+    assert numbers.min() >= 0.0 and numbers.max() < 1.0
     counts = torch.histc(numbers, 10, 0, 1) / numbers.numel()
     assert (counts - 0.1).abs().max() < 0.005
     assert torch.corrcoef(numbers.T).fill_diagonal_(0).abs().max() < 0.1

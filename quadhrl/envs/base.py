@@ -14,12 +14,12 @@ from torchrl.envs import EnvBase
 
 from quadhrl.envs import rewards
 from quadhrl.envs.curriculum import CurriculumConfig, TerrainCurriculum
-from quadhrl.envs.kinematics import RollPitchYaw, roll_pitch_yaw, rotate_vectors, rotate_yaw
 from quadhrl.envs.scan import SCAN_POINTS, scan, scan_pattern
 from quadhrl.envs.threads import one_thread_for_small_batches
 from quadhrl.envs.trajectory_generator import ACTION_DIM, TrajectoryGenerator, TrajectoryGeneratorConfig
 from quadhrl.errors import check_range
 from quadhrl.robots import get_robot
+from quadhrl.rotations import RollPitchYaw, roll_pitch_yaw, rotate_vectors, rotate_yaw
 from quadhrl.sim import PhysicsConfig, Readings, TerrainConfig, make_simulator
 
 __all__ = ["LocomotionConfig", "LocomotionEnv", "SharedRewardConfig", "TerminationConfig"]

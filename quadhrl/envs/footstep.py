@@ -12,10 +12,10 @@ from torchrl.data import Unbounded
 
 from quadhrl.envs import rewards
 from quadhrl.envs.base import LocomotionConfig, LocomotionEnv, SharedRewardConfig, TerminationConfig
-from quadhrl.envs.kinematics import rotate_yaw
 from quadhrl.envs.scan import SCAN_POINTS
 from quadhrl.envs.targets import FootstepTargets, TargetConfig
 from quadhrl.errors import check_range
+from quadhrl.rotations import rotate_yaw
 from quadhrl.sim import Readings
 
 __all__ = ["FootstepConfig", "FootstepEnv", "FootstepRewardConfig", "FootstepTerminationConfig"]

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from quadhrl.envs.kinematics import LegKinematics, RollPitchYaw
+from quadhrl.envs.kinematics import LegKinematics
 from quadhrl.errors import check_range
 from quadhrl.robots import Robot
+from quadhrl.rotations import RollPitchYaw
 
 __all__ = ["ACTION_DIM", "TrajectoryGenerator", "TrajectoryGeneratorConfig"]
 

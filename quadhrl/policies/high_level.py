@@ -10,11 +10,11 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from quadhrl.envs.kinematics import rotate_yaw
 from quadhrl.errors import InputError, check_range
 from quadhrl.policies.goal_search import SEARCHES, PairCandidates
 from quadhrl.policies.goal_value import GoalValue, ModuleValue, goal_value
 from quadhrl.policies.objective import Direction, ObjectiveTerm, PairTargets
+from quadhrl.rotations import rotate_yaw
 
 __all__ = ["GridProblem", "HighLevelConfig", "HighLevelPolicy"]
 

@@ -249,7 +249,9 @@ def test_the_environment_adopts_the_targets_of_a_rewritten_goal():
     untouched = torch.ones(3, 4, dtype=torch.bool)
     untouched[1, 1] = False
     assert torch.equal(env.targets.position[untouched], position[untouched]), "bit by bit"
-    assert torch.equal(env.targets.following[:2], following[:2]) and torch.equal(env.targets.following[2, 1], following[2, 1])
+    assert torch.equal(env.targets.following[:2], following[:2]) and torch.equal(
+        env.targets.following[2, 1], following[2, 1]
+    )
     yaw = float(after["yaw"][1])
     turn = torch.tensor([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]], dtype=torch.float32)
     assert torch.allclose(after["goal"][1, 2:4], turn @ (wish - after["feet"][1, 1]), atol=1e-6)
@@ -266,7 +268,9 @@ def test_goals_written_in_place_or_not_finite():
     position = env.targets.position.clone()
     env.step(td.set("action", torch.zeros(2, 15)))
     moved = (env.targets.position - position).norm(dim=-1)
-    assert moved[0, 1] == pytest.approx(0.1, abs=1e-6) and moved.sum() == moved[0, 1], "written in place counts, NaN does not"
+    assert moved[0, 1] == pytest.approx(0.1, abs=1e-6) and moved.sum() == moved[0, 1], (
+        "written in place counts, NaN does not"
+    )
     assert torch.isfinite(env.targets.position).all()
 
 

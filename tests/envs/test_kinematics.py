@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from quadhrl.envs.kinematics import LegKinematics, roll_pitch_yaw, rotate_yaw
+from quadhrl.envs.kinematics import LegKinematics
+from quadhrl.rotations import roll_pitch_yaw, rotate_yaw
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-9), (torch.float32, 1e-5)])

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from quadhrl.envs.kinematics import LegKinematics, RollPitchYaw
+from quadhrl.envs.kinematics import LegKinematics
 from quadhrl.envs.trajectory_generator import TrajectoryGenerator, TrajectoryGeneratorConfig, lift, stride
+from quadhrl.rotations import RollPitchYaw
 
 
 def authors_x(p):

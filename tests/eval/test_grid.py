@@ -62,14 +62,16 @@ def test_records_equal_sums_over_a_plain_rollout():
 
     env = _make_env(method, jobs(name, ROUGH, 1), StopRules(max_steps=120), "native", torch.device("cpu"), 0)
     td, reward, collisions, pairs = env.reset(), 0.0, 0, 0
-    for step in range(120):
+    steps = 0
+    while steps < 120:
+        steps += 1
         td = env.step(td.set("action", mean_action_of(method, td)))["next"]
         reward += float(td["reward"][0])
         collisions += int(env.sim.readings.collisions[0])
         pairs += int(td["events", "pair_hit"][0])
         if bool(td["done"][0]):
             break
-    assert (record.steps, record.collisions, record.pairs) == (step + 1, collisions, pairs)
+    assert (record.steps, record.collisions, record.pairs) == (steps, collisions, pairs)
     assert record.reward == pytest.approx(reward, rel=1e-6)
     assert record.distance == pytest.approx(float(env.sim.qpos[0, 0]), abs=1e-5)
     assert record.outcome == "timeout"
@@ -104,7 +106,9 @@ def test_stop_rules():
     assert (ended.outcome, ended.steps) == ("stuck", 300)
     assert ended.reward == pytest.approx(free.reward_until_stuck)
     flail = dataclasses.replace(stand, act=lambda td: torch.sign(torch.sin(torch.arange(15.0) * 2)).expand(len(td), -1))
-    (fallen,) = run_episodes(flail, jobs("x", TestTerrain(0.3, 0.1), 1), StopRules(900), seed=0, engine="native", device=cpu)
+    (fallen,) = run_episodes(
+        flail, jobs("x", TestTerrain(0.3, 0.1), 1), StopRules(900), seed=0, engine="native", device=cpu
+    )
     assert fallen.outcome in ("fall", "timeout") and fallen.steps <= 900
 
 
@@ -188,7 +192,11 @@ def finished(tmp_path_factory):
 
 def test_everything_is_written(finished):
     names = {path.name for path in finished.iterdir()}
-    charts = {f"{chart}.{kind}" for chart in ("normalized_reward", "distance", "collisions", "landscape") for kind in ("png", "svg")}
+    charts = {
+        f"{chart}.{kind}"
+        for chart in ("normalized_reward", "distance", "collisions", "landscape")
+        for kind in ("png", "svg")
+    }
     assert names == charts | {"episodes.csv", "summary.json", "report.html", "configuration.json"}
     summary = json.loads((finished / "summary.json").read_text())
     assert set(summary["claims"]) == set(PUBLISHED_CLAIMS) and summary["claims_of"] == 2

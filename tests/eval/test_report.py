@@ -56,7 +56,9 @@ def test_report_in_a_browser(report, browser, width):
     urls = [r["request"]["url"] for r in requests if r["documentURL"] == report.as_uri()]  # not the browser's own pages
     assert urls and all(url == report.as_uri() or url.startswith("data:") for url in urls), urls
     # Nothing sticks out of the page; wide tables scroll by themselves.
-    overflow = browser.execute_script("return document.documentElement.scrollWidth - document.documentElement.clientWidth")
+    overflow = browser.execute_script(
+        "return document.documentElement.scrollWidth - document.documentElement.clientWidth"
+    )
     assert overflow <= 0
     text = browser.find_element("tag name", "body").text
     for words in ("alternating", "normalised reward", "training-", "95", "llp-in-place", "episodes.csv", "published"):

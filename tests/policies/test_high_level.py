@@ -105,7 +105,10 @@ def test_gradient_equals_finite_differences_and_is_each_worlds_own(networks, sta
             full, score = goal.copy(), 0.0
             for k in (0, 1):
                 to_next, to_following = targets[0, k] - feet[active[k]], targets[1, k] - feet[stance[k]]
-                full[2 * active[k] : 2 * active[k] + 2], full[8 + 2 * k : 10 + 2 * k] = turn @ to_next, turn @ to_following
+                full[2 * active[k] : 2 * active[k] + 2], full[8 + 2 * k : 10 + 2 * k] = (
+                    turn @ to_next,
+                    turn @ to_following,
+                )
                 score += 50.0 * (to_next[0] + 2 * to_following[0])
             return numpy_value(networks, state, full[None])[0] + score
 
@@ -188,7 +191,9 @@ def test_targets_and_goal_say_the_same(networks, states):
         yaw = float(state["yaw"])
         turn = torch.tensor([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
         for k in (0, 1):
-            assert torch.allclose(goal.view(6, 2)[active[k]], turn @ (targets[0, k] - state["feet"][active[k]]), atol=1e-6)
+            assert torch.allclose(
+                goal.view(6, 2)[active[k]], turn @ (targets[0, k] - state["feet"][active[k]]), atol=1e-6
+            )
             assert torch.allclose(goal.view(6, 2)[4 + k], turn @ (targets[1, k] - state["feet"][stance[k]]), atol=1e-6)
             assert torch.equal(goal.view(6, 2)[stance[k]], state["goal"].view(6, 2)[stance[k]]), "stance stays"
 
