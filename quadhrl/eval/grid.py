@@ -20,7 +20,7 @@ from quadhrl.errors import InputError, check_range, command_line
 from quadhrl.eval.charts import draw_charts
 from quadhrl.eval.landscape import draw_landscape
 from quadhrl.eval.methods import METHODS, make_method
-from quadhrl.eval.report import write_report
+from quadhrl.eval.report import write_report, write_table
 from quadhrl.eval.results import ResultsFolder
 from quadhrl.eval.rollouts import Episode, Job, StopRules, run_episodes
 from quadhrl.eval.summary import Normalizer, Summary, bootstrap_mean, published_json, summarize
@@ -96,7 +96,7 @@ REFERENCE_RULES = StopRules(max_steps=3600, end_when_stuck=True)
 
 
 def run_grid(config: GridConfig) -> Path:
-    """Run what is missing, and write figures, ``summary.json`` and ``report.html``; returns the report's path.
+    """Run what is missing, and write figures, ``summary.json``, ``table.md`` and ``report.html``; returns the report's path.
 
     Raises:
         InputError: a setting, a checkpoint or the results folder is not usable.
@@ -136,6 +136,7 @@ def run_grid(config: GridConfig) -> Path:
     }
     facts = _facts(config, folder, policies, normalizers)
     _write_summary(folder.path / "summary.json", summary, variants, facts | {"run": run})
+    write_table(folder.path, summary)
     return write_report(folder.path, config, summary, variants, facts, run)
 
 

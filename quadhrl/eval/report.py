@@ -16,7 +16,7 @@ from quadhrl.eval.terrains import PUBLISHED, PUBLISHED_CLAIMS
 if TYPE_CHECKING:
     from quadhrl.eval.grid import GridConfig
 
-__all__ = ["write_report"]
+__all__ = ["write_report", "write_table"]
 
 
 def write_report(
@@ -53,4 +53,36 @@ def write_report(
     )  # fmt: skip
     path = folder / "report.html"
     path.write_text(page)
+    return path
+
+
+def write_table(folder: Path, summary: Summary) -> Path:
+    """Write the means of every terrain as a Markdown table, ``table.md``, published figures in brackets; returns its path."""
+    columns = [
+        (method, metric, title)
+        for metric, title in (
+            ("normalized_reward", "reward %"),
+            ("distance", "distance m"),
+            ("collisions", "collisions/step"),
+        )
+        for method in ("hlp", "end-to-end", *(("llp-in-place",) if metric == "normalized_reward" else ()))
+        if method in summary.cells
+    ]
+    lines = [
+        "| infill % / height m | " + " | ".join(f"{title}, {method}" for method, _, title in columns) + " |",
+        "| --- |" + " ---: |" * len(columns),
+    ]
+    for terrain in summary.terrains:
+        cells = []
+        for method, metric, _ in columns:
+            cell = summary.cells[method].get(terrain)
+            digits = {"normalized_reward": 0, "distance": 1, "collisions": 2}[metric]
+            text = "" if cell is None else f"{cell[metric].mean:.{digits}f}"
+            if terrain in PUBLISHED and method != "llp-in-place":
+                published = getattr(PUBLISHED[terrain], CHARTS[metric][0])[("hlp", "end-to-end").index(method)]
+                text += f" ({published:.{digits}f})"
+            cells.append(text)
+        lines.append(f"| {terrain.label} | " + " | ".join(cells) + " |")
+    path = folder / "table.md"
+    path.write_text("\n".join(lines) + "\n")
     return path

@@ -60,28 +60,27 @@ def exact_search(value: GoalValue, first: PairCandidates, second: PairCandidates
 def alternating_search(value: GoalValue, first: PairCandidates, second: PairCandidates) -> tuple[Tensor, Tensor]:
     """Maximise over the first pair with the second fixed, then over the second, and so on until nothing changes.
 
-    Begins in every world with `STARTS` of the second pair's candidates, spread evenly over their list. Starts that arrive where
-    another has been are given up; the best of the others wins.
+    Begins in every world with `STARTS` of the second pair's candidates, spread evenly over their list. A start that arrives where
+    another has been is given up.
     """
     worlds, columns = second.score.shape
     device = second.score.device
-    visited = torch.zeros(worlds, columns, dtype=torch.bool, device=device)
+    tried_first, tried_second = (torch.zeros_like(pair.score, dtype=torch.bool) for pair in (first, second))
     best = first.score.new_full((worlds,), -torch.inf)
     best_i, best_j = torch.zeros(2, worlds, dtype=torch.long, device=device)
     golden = (
         torch.arange(min(STARTS, columns), device=device) * 0.6180339887 + 0.5
     )  # fractional parts fill [0, 1) evenly
     j = (golden % 1.0 * columns).long().unique()
-    w, j = torch.arange(worlds, device=device).repeat_interleave(len(j)), j.repeat(worlds)
+    w, j = _untried(tried_second, torch.arange(worlds, device=device).repeat_interleave(len(j)), j.repeat(worlds))
     while len(w):
-        visited[w, j] = True
         _, i = _best_response(value, first, w, second.embedding[w, j])
-        objective, response = _best_response(value, second, w, first.embedding[w, i])
-        objective = objective + first.score[w, i]
-        best, best_i, best_j = _keep_best((best, best_i, best_j), w, objective, i, response)
-        on = ~visited[w, response]
-        key = (w[on] * columns + response[on]).unique()
-        w, j = key // columns, key % columns
+        w, i = _untried(tried_first, w, i)
+        if len(w) == 0:
+            break
+        objective, j = _best_response(value, second, w, first.embedding[w, i])
+        best, best_i, best_j = _keep_best((best, best_i, best_j), w, objective + first.score[w, i], i, j)
+        w, j = _untried(tried_second, w, j)
     return best_i, best_j
 
 
@@ -130,6 +129,10 @@ def _best_of_table(
     return index // columns, index % columns
 
 
+ROWS_AT_ONCE = 4096
+"""The same in a best response: few enough for the second-level cache."""
+
+
 def _best_response(value: GoalValue, own: PairCandidates, worlds: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
     """Best of one pair's candidates in the worlds [K], each against a contribution ``other`` [K, D] of the other pair.
 
@@ -139,13 +142,22 @@ def _best_response(value: GoalValue, own: PairCandidates, worlds: Tensor, other:
     if len(worlds) == 1:  # the product of a single matrix rounds differently from that of several: see `FactoredValue`
         objective, index = _best_response(value, own, worlds.repeat(2), other.repeat(2, 1))
         return objective[:1], index[:1]
-    parts = -(-len(worlds) * own.score.shape[1] // MAX_ROWS)
+    parts = -(-len(worlds) * own.score.shape[1] // ROWS_AT_ONCE)
     found = []
     for w, embedding in zip(worlds.tensor_split(parts), other.tensor_split(parts), strict=True):
         table = value[w].value(own.embedding[w] + embedding[:, None]) + own.score[w]
         found.append(table.max(1))
     objective, index = (torch.cat(results) for results in zip(*found, strict=True))
     return objective, index
+
+
+def _untried(tried: Tensor, worlds: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+    """Those candidates ``index`` [K] of the worlds [K] that were not tried yet, once each; marks them in ``tried`` [N, M]."""
+    new = ~tried[worlds, index]
+    key = (worlds[new] * tried.shape[1] + index[new]).unique()
+    worlds, index = key // tried.shape[1], key % tried.shape[1]
+    tried[worlds, index] = True
+    return worlds, index
 
 
 def _keep_best(

@@ -110,24 +110,31 @@ class HighLevelPolicy(TensorDictModuleBase):
         following = self.config.following_ratio if self.config.pairs == "both" else 0.0
         self.register_buffer("half_width", torch.stack([half_width, following * half_width]))
         self.register_buffer("pairs", torch.tensor([[0, 3], [1, 2]]))
+        self.to(next((parameter.device for parameter in value.parameters()), torch.device("cpu")))
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Choose targets in every world; see the class."""
-        starts = range(0, len(tensordict), WORLDS_AT_ONCE)
-        chosen = [self._choose(tensordict, slice(start, start + WORLDS_AT_ONCE)) for start in starts]
+        flat = tensordict.select(*self.in_keys).reshape(-1)
+        starts = range(0, len(flat), WORLDS_AT_ONCE)
+        chosen = [self._choose(flat, slice(start, start + WORLDS_AT_ONCE)) for start in starts]
         for key, values in zip(self.out_keys, zip(*chosen, strict=True), strict=True):
-            tensordict[key] = torch.cat(values)
+            tensordict[key] = torch.cat(values).unflatten(0, tensordict.batch_size)
         return tensordict
 
     def _choose(self, tensordict: TensorDictBase, worlds: slice) -> tuple[Tensor, Tensor, Tensor]:
         """What `forward` writes, for some of the worlds."""
         problem = GridProblem(self, tensordict[worlds], worlds)
-        targets, objective = problem.ascend(problem.search())
         steps: Tensor = tensordict["events", "step_count"][worlds]
         started = (tensordict["pair"][worlds] >= self.config.start_pair) & (steps >= self.config.start_step)
-        goal = torch.where(started, problem.goal(targets), tensordict["goal"][worlds])
-        return goal, torch.where(started[..., None, None], targets, problem.observed_targets), objective[:, None]
+        goal, targets = tensordict["goal"][worlds], problem.observed_targets
+        objective = problem.objective(targets).detach()
+        if started.any():
+            chosen, its_objective = problem.ascend(problem.search())
+            goal = torch.where(started, problem.goal(chosen), goal)
+            targets = torch.where(started[..., None, None], chosen, targets)
+            objective = torch.where(started[:, 0], its_objective, objective)
+        return goal, targets, objective[:, None]
 
     def offsets(self, following: bool) -> Tensor:
         """One pair's grid: displacements of its feet from their last targets [M, 2, 2], m; M = R^4 (1 where it is fixed)."""

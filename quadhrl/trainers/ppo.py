@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.checkpoint import Checkpoint, GlobalRNGState
+from torchrl.checkpoint import Checkpoint, CheckpointError, GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.objectives import ClipPPOLoss
 
@@ -197,12 +197,12 @@ class PPOTrainer:
         """Carry on exactly where the checkpoint was saved.
 
         Raises:
-            InputError: its environment's state is of another version.
+            InputError: it is damaged, or its environment's state is of another version.
         """
         try:
             self.checkpoint().load(path, map_location=self.device)
-        except KeyError as error:
-            remedy = "an earlier version wrote its environment's state; start a new run with --init-from"
+        except CheckpointError as error:
+            remedy = "it is damaged or another version wrote its environment's state; start a new run with --init-from"
             raise InputError("--resume", str(path), remedy) from error
         self.collector.reset(keep_state=True)
 

@@ -2,13 +2,17 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+import quadhrl
 from quadhrl.errors import InputError
 from quadhrl.eval.play import PlayConfig, play
 from quadhrl.trainers.config import parse_command_line
 from quadhrl.trainers.ppo import train
+
+ASSETS = Path(quadhrl.__file__).parent / "assets"
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +42,17 @@ def test_film_and_picture_of_a_trained_policy(run, tmp_path):
     picture = imageio.imread(tmp_path / "a.png")
     red = (picture[..., 0] > 150) & (picture[..., 1] < 110) & (picture[..., 2] < 80)
     assert red.sum() > 20, "the next targets are drawn"
+
+
+def test_high_level_policy_walks_and_forward_policy_is_filmed(tmp_path):
+    footstep, forward = (str(ASSETS / f"{task}.torchrl") for task in ("footstep", "forward"))
+    scalars = play(PlayConfig(footstep, hlp=True, heading=30.0, seconds=1.2, num_envs=2, infill=1.0, height_range=0.0))
+    assert scalars["rollout/pairs_per_second"] > 3
+    picture = tmp_path / "a.png"
+    scalars = play(PlayConfig(forward, picture=str(picture), seconds=1.0, num_envs=2, width=320, height=240))
+    assert scalars["reward/forward_velocity"] > 0.1 and picture.stat().st_size > 5000
+    with pytest.raises(InputError, match=r"--hlp: got True; .*footstep"):
+        play(PlayConfig(forward, hlp=True))
 
 
 @pytest.mark.parametrize("policy", ["zero", "random"])

@@ -184,6 +184,14 @@ def test_heading_per_world_reaches_the_right_worlds(networks, states, monkeypatc
         assert torch.allclose(hlp(many.clone())["targets"][k], whole[k], atol=1e-4)
 
 
+def test_any_batch_shape_goes(networks, states):
+    hlp = HighLevelPolicy(networks.value(), HighLevelConfig(resolution=3))
+    flat = hlp(states.clone())
+    folded = hlp(states.clone().reshape(2, 3))
+    assert folded["targets"].shape == (2, 3, 2, 2, 2)
+    assert torch.equal(folded["goal"].reshape(6, 12), flat["goal"])
+
+
 def test_targets_and_goal_say_the_same(networks, states):
     out = HighLevelPolicy(networks.value(), HighLevelConfig(resolution=3))(states.clone())
     for state, goal, targets in zip(states, out["goal"], out["targets"], strict=True):

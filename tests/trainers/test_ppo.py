@@ -238,3 +238,30 @@ def with_metadata(source: Path, target: Path, **changes) -> Path:
                 content = json.dumps(manifest)
             new.writestr(name, content)
     return target
+
+
+def test_the_forward_task_trains_resumes_and_keeps_its_own_config(tmp_path):
+    flags = ["--task", "forward", "--log-dir", str(tmp_path), "--run-name", "f", "--rewards.lateral-power", "2"]
+    train(tiny(*flags, "--total-steps", "1360"))
+    config = train_config_from_dict(json.loads((tmp_path / "f" / "config.json").read_text()))
+    assert (config.task, config.env.rewards.lateral_power) == ("forward", 2)
+    loaded = load_networks(tmp_path / "f", task="forward")
+    assert loaded.networks.observations == {"proprioception": 77, "scan": 284}
+    rewards = [value for _, value in read_scalars(tmp_path / "f")["rollout/reward"]]
+    largest = max(sum(rewards[k : k + 16]) / 16 for k in range(len(rewards) - 15))
+    assert loaded.metadata["max_reward"] == pytest.approx(largest, rel=1e-4)
+    resume = ["--resume", str(tmp_path / "f")]
+    command(*resume, "--total-steps", "1440", check=0)
+    assert load_networks(tmp_path / "f").metadata["samples"] == 1440
+    done = command(*resume, "--task", "footstep", check=2)
+    assert "--task: got 'footstep'; this run's task is 'forward'" in done.stderr
+
+
+def test_a_checkpoint_with_another_versions_state_is_refused(run, tmp_path):
+    trainer = PPOTrainer(tiny())
+    state = trainer.env.state_dict()
+    del state["task"]["footholds"]
+    trainer.env.state_dict = lambda *_: state
+    path = trainer.checkpoint().save(tmp_path / "old.ckpt")
+    with pytest.raises(InputError, match="start a new run with --init-from"):
+        PPOTrainer(tiny()).load(path)
