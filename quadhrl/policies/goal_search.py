@@ -130,7 +130,7 @@ def _best_of_table(
 
 
 ROWS_AT_ONCE = 4096
-"""The same in a best response: few enough for the second-level cache."""
+"""The same in `alternating_search`, where smaller pieces, which stay in the caches, are faster."""
 
 
 def _best_response(value: GoalValue, own: PairCandidates, worlds: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
@@ -167,9 +167,8 @@ def _keep_best(
     top = best[0].scatter_reduce(0, worlds, objective, "amax")
     position = torch.arange(len(worlds), device=worlds.device)
     wins = (objective == top[worlds]) & (objective > best[0][worlds])
-    first = torch.full_like(best[1], len(worlds)).scatter_reduce(
-        0, worlds[wins], position[wins], "amin"
-    )  # ties: the first
+    nobody = torch.full_like(best[1], len(worlds))
+    first = nobody.scatter_reduce(0, worlds[wins], position[wins], "amin")  # the first of equals
     new = first < len(worlds)
     chosen = first.clamp(max=len(worlds) - 1)
     return top, torch.where(new, i[chosen], best[1]), torch.where(new, j[chosen], best[2])

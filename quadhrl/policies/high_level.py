@@ -116,8 +116,10 @@ class HighLevelPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Choose targets in every world; see the class."""
         flat = tensordict.select(*self.in_keys).reshape(-1)
-        starts = range(0, len(flat), WORLDS_AT_ONCE)
-        chosen = [self._choose(flat, slice(start, start + WORLDS_AT_ONCE)) for start in starts]
+        parts = torch.arange(len(flat)).tensor_split(
+            -(-len(flat) // WORLDS_AT_ONCE)
+        )  # of equal sizes, so never of one world
+        chosen = [self._choose(flat, slice(int(part[0]), int(part[-1]) + 1)) for part in parts]
         for key, values in zip(self.out_keys, zip(*chosen, strict=True), strict=True):
             tensordict[key] = torch.cat(values).unflatten(0, tensordict.batch_size)
         return tensordict
@@ -145,7 +147,7 @@ class HighLevelPolicy(TensorDictModuleBase):
 
 
 WORLDS_AT_ONCE = 64
-"""Worlds that are searched together: 40 MB of candidates with the paper's grid and critic."""
+"""At most this many worlds are searched together: 40 MB of candidates with the paper's grid and critic."""
 
 
 class GridProblem:
