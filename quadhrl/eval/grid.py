@@ -107,10 +107,10 @@ def run_grid(config: GridConfig) -> Path:
     policies = _load(config)
     folder = ResultsFolder(Path(config.out), _fingerprint(config, str(device)))
     batches = list(_plan(config, folder, policies))
-    progress = _Progress(sum(len(jobs) for _, jobs, _ in batches), len(folder.episodes))
+    progress = _Progress(batches, len(folder.episodes))
     for name, jobs, rules in batches:
         method = make_method(name, policies[METHODS[name].task], config.hlp)
-        progress.begin(jobs[0].method, len(jobs), rules.max_steps)
+        progress.begin(name, jobs, rules)
         for episode in run_episodes(
             method, jobs, rules, seed=config.seed, engine=config.engine, device=device, report=progress.report
         ):
@@ -238,23 +238,38 @@ def _write_summary(path: Path, summary: Summary, variants: dict[str, Summary], f
     path.write_text(json.dumps(content, indent=1) + "\n")
 
 
+HLP_COST = 50.0
+"""A world's control step with the high-level policy, in steps without it (native engine, two cores)."""
+
+
 class _Progress:
-    """A line with the time that is left: in place on a terminal, now and then elsewhere."""
+    """A line with the time that is left: in place on a terminal, now and then elsewhere.
+
+    Args:
+        batches: method, jobs and stop rules of what is to be run.
+        before: rollouts that are there already.
+    """
 
     LINE_SECONDS = 20.0
 
-    def __init__(self, total: int, before: int) -> None:
-        self._console, self._total = Console(), total
+    def __init__(self, batches: list[tuple[str, list[Job], StopRules]], before: int) -> None:
+        self._console = Console()
+        self._total = sum(len(jobs) for _, jobs, _ in batches)
+        # Half of the most that a batch may take: some rollouts end early, some never.
+        self._to_come = sum(0.5 * len(jobs) * rules.max_steps * _cost(name) for name, jobs, rules in batches)
+        self._work = 0.0  # done so far, in world-steps without high-level policy
         self._began, self._last = time.monotonic(), 0.0
         self.finished = 0
         """Rollouts that ended in this run."""
         self._status = self._console.status("") if self._console.is_terminal else None
         if before:
-            self._console.print(f"{before} rollouts are there already, {total} to go")
+            self._console.print(f"{before} rollouts are there already, {self._total} to go")
 
-    def begin(self, name: str, rollouts: int, max_steps: int) -> None:
+    def begin(self, method: str, jobs: list[Job], rules: StopRules) -> None:
         """A batch begins."""
-        self._name, self._rollouts, self._max_steps, self._ended = name, rollouts, max_steps, 0
+        self._name, self._rollouts, self._ended = jobs[0].method, len(jobs), 0
+        self._max_steps, self._cost = rules.max_steps, _cost(method)
+        self._to_come -= 0.5 * len(jobs) * rules.max_steps * self._cost
         if self._status is not None:
             self._status.start()
 
@@ -265,16 +280,17 @@ class _Progress:
 
     def report(self, step: int, running: int) -> None:
         """A step has been taken."""
+        self._work += running * self._cost
         now = time.monotonic()
         over = running == 0 and self.finished >= self._total
         if not over and now - self._last < (0.5 if self._status is not None else self.LINE_SECONDS):
             return
         self._last = now
-        done = self.finished + running * step / self._max_steps
-        left = (now - self._began) * (self._total - done) / max(done, 1e-3)
+        left = self._to_come + 0.5 * running * (self._max_steps - step) * self._cost
+        eta = (now - self._began) * left / max(self._work, 1.0)
         text = (
             f"{self._name}: {self._ended} of {self._rollouts} rollouts, step {step}; "
-            f"{self.finished} of {self._total} in all, ETA {left / 60:.1f} min"
+            f"{self.finished} of {self._total} in all, ETA {eta / 60:.1f} min"
         )
         if self._status is None:
             self._console.print(text, highlight=False, soft_wrap=True)
@@ -282,6 +298,10 @@ class _Progress:
             self._status.stop()
         else:
             self._status.update(text)
+
+
+def _cost(method: str) -> float:
+    return HLP_COST if method == "hlp" else 1.0
 
 
 def main() -> None:
