@@ -39,7 +39,7 @@ class GoalValue(ABC):
 
     @abstractmethod
     def value(self, embedding: Tensor) -> Tensor:
-        """Values [N, K] of the sums [N, K, D] of a next and a following pair's contributions."""
+        """Values [N, K] of the sums [N, K, D] of a next and a following pair's contributions, which may be overwritten."""
 
     @abstractmethod
     def __getitem__(self, worlds: slice | Tensor) -> GoalValue:
@@ -125,11 +125,11 @@ class FactoredValue(GoalValue):
         return sums
 
     def value(self, embedding: Tensor) -> Tensor:
-        """The rest of the critic on first-layer sums [N, K, H]."""
-        n = len(embedding)
-        hidden = functional.elu(embedding)
+        """The rest of the critic on first-layer sums [N, K, H], which are overwritten where no gradient is asked for."""
+        n, overwrite = len(embedding), not torch.is_grad_enabled()
+        hidden = functional.elu(embedding, inplace=overwrite)
         for weight, bias in self.rest[:-1]:
-            hidden = functional.elu(torch.bmm(hidden, _batched(weight, n)).add_(bias))
+            hidden = functional.elu(torch.bmm(hidden, _batched(weight, n)).add_(bias), inplace=overwrite)
         weight, bias = self.rest[-1]
         value = torch.bmm(hidden, _batched(weight, n))[..., 0] + bias
         return value * self.scale[0] + self.scale[1]
