@@ -174,7 +174,7 @@ def _keep_best(
     return top, torch.where(new, i[chosen], best[1]), torch.where(new, j[chosen], best[2])
 
 
-SCREENED = 4096
+SCREENED = 1024
 """Combinations that `exact_search` computes again in float32, at first."""
 
 
