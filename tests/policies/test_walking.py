@@ -38,11 +38,14 @@ def test_it_walks_forward_with_strides_at_the_grids_edge(networks):
     assert (speed > 0.2).all(), speed
 
 
-def test_without_the_directional_term_it_stays_in_place(networks):
-    env = make_env(2, infill=1.0, height_range=0.0)
-    walk(env, 260, networks, HighLevelPolicy(networks.value(), HighLevelConfig(direction_weight=0.0)))
-    with_direction = 0.2 * 260 / 60
-    assert (env.sim.readings.base_position[:, :2].norm(dim=-1) < 0.6 * with_direction).all()
+def test_without_the_directional_term_it_hardly_gets_anywhere(networks):
+    """The value alone has no reason to go far; that of the shipped policy likes small steps forward."""
+    distance = {}
+    for weight in (0.0, 50.0):
+        env = make_env(2, infill=1.0, height_range=0.0)
+        walk(env, 260, networks, HighLevelPolicy(networks.value(), HighLevelConfig(direction_weight=weight)))
+        distance[weight] = env.sim.readings.base_position[:, :2].norm(dim=-1)
+    assert (distance[0.0] < 0.5 * distance[50.0]).all(), distance
 
 
 def test_it_walks_sideways_and_turns_when_the_heading_changes(networks):
