@@ -44,7 +44,7 @@ class HighLevelConfig:
     ascent_steps: int = 5
     """Steps of the gradient ascent, N."""
     confine: bool = True
-    """Whether the gradient ascent stays in the box; without, a target can leave it by about 4 cm."""
+    """Whether the gradient ascent stays in the box; without, a target can leave it by some centimetres."""
     search: str = "alternating"
     """Grid search: alternating, exact or naive; see quadhrl.policies.goal_search."""
     start_step: int = 60
