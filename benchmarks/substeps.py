@@ -1,92 +1,84 @@
-"""Two physics steps of 1/120 s per control step against four of 1/240 s: do trajectories and returns agree?
+"""How many physics steps does a control step need? Speed, how deep the feet sink in, collisions and returns for several numbers.
 
-``python benchmarks/substeps.py CHECKPOINT`` replays one recorded sequence of joint targets on both and prints how far the bases
-drift apart, then lets the policy (deterministic, the paper's episode ends) play on both and prints its statistics.
+``python benchmarks/substeps.py CHECKPOINT`` lets a policy of either task (deterministic, the paper's episode ends) act on level
+ground and on the training terrain. Contacts take their stiffness from the time step (see `quadhrl.sim.scene`).
 """
 
 from __future__ import annotations
 
 import copy
 import sys
-import warnings
+import time
 from dataclasses import dataclass
 from typing import Annotated
 
 import quadhrl  # noqa: F401  (before torch: see there)  # isort: skip
 import torch
 import tyro
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from quadhrl.envs import FootstepEnv
-from quadhrl.envs.footstep import FootstepTerminationConfig
+from quadhrl.envs import ENVIRONMENTS, LocomotionEnv
 from quadhrl.errors import command_line
+from quadhrl.eval.methods import mean_action
 from quadhrl.trainers.checkpoint import LoadedPolicy, load_networks
-from quadhrl.trainers.statistics import rollout_statistics
 
 
 @dataclass
 class SubstepsConfig:
-    """Compare 2 and 4 physics steps per control step."""
+    """Compare numbers of physics steps per control step."""
 
     checkpoint: Annotated[str, tyro.conf.Positional]
     """Checkpoint file or run directory."""
+    substeps: tuple[int, ...] = (2, 3, 4, 6, 8)
+    """Physics steps per control step to compare."""
     worlds: int = 128
     """Number of worlds."""
-    seconds: float = 20.0
+    seconds: float = 10.0
     """Simulated time of each rollout [s]."""
     seed: int = 0
     """Seed of targets and terrains."""
 
 
-def build(loaded: LoadedPolicy, config: SubstepsConfig, substeps: int) -> FootstepEnv:
+def build(loaded: LoadedPolicy, config: SubstepsConfig, substeps: int, infill: float, height: float) -> LocomotionEnv:
     settings = copy.deepcopy(loaded.config.env)
     settings.physics.substeps, settings.curriculum.enabled = substeps, False
-    settings.termination = FootstepTerminationConfig()
-    return FootstepEnv(settings, config.worlds, seed=config.seed)
+    settings.terrain.infill, settings.terrain.height_range = infill, height
+    settings.termination = type(settings.termination)()
+    return ENVIRONMENTS[loaded.config.task](settings, config.worlds, seed=config.seed)
 
 
-def compare_trajectories(loaded: LoadedPolicy, config: SubstepsConfig) -> None:
-    coarse, fine = (build(loaded, config, substeps) for substeps in (2, 4))
-    policy, td = loaded.networks.policy(), coarse.reset()
-    fine.reset()
-    print("distance between the bases, same joint targets [mm]: median, 90 %")
-    for k in range(1, 121):
-        td = policy(td)
-        advance = coarse.sim.step
-
-        def both(targets: torch.Tensor):
-            fine.sim.step(targets)
-            return advance(targets)  # noqa: B023
-
-        coarse.sim.step = both
-        td = coarse.step(td)["next"]
-        coarse.sim.step = advance
-        if k in (1, 6, 12, 30, 60, 120):
-            apart = (coarse.sim.readings.base_position - fine.sim.readings.base_position).norm(dim=-1) * 1000
-            print(f"  after {k / 60:4.2f} s: {apart.median():8.2f} {apart.quantile(0.9):8.2f}")
-
-
-def compare_returns(loaded: LoadedPolicy, config: SubstepsConfig) -> None:
-    print("substeps  reward/step  pairs/s  falls/min  collision term/step")
-    for substeps in (2, 4):
-        env = build(loaded, config, substeps)
-        rollout = env.rollout(round(config.seconds * 60), loaded.networks.policy(), break_when_any_done=False)
-        found = rollout_statistics(rollout, 1 / 60)
-        print(
-            f"{substeps:8d} {found['rollout/reward']:12.3f} {found['rollout/pairs_per_second']:8.2f}"
-            f" {found['rollout/falls_per_minute']:10.2f} {found['reward/collision']:20.4f}"
-        )
+@torch.no_grad()
+def measure(env: LocomotionEnv, loaded: LoadedPolicy, steps: int) -> str:
+    """One line: reward, collisions, falls, depth of the loaded feet below the ground, and speed."""
+    radius = env.sim.scene.model.geom_size[env.sim.scene.feet[0], 0]
+    reward, collisions, falls, depths = 0.0, 0.0, 0, []
+    td, start = env.reset(), time.perf_counter()
+    for _ in range(steps):
+        td["action"] = mean_action(loaded.networks, td)
+        td = env.step(td)["next"]
+        now = env.sim.readings
+        ground = env.terrain.heights(now.foot_position[..., :2].contiguous())
+        depth = (ground + radius - now.foot_position[..., 2])[now.foot_force[..., 2] > 20]
+        depths.append(depth[depth < 0.1])  # a foot beside a block stands under no ground of its own
+        reward += td["reward"].mean().item() / steps
+        collisions += now.collisions.float().mean().item() / steps
+        falls += int(sum(td["events", name].sum().item() for name in ("fall", "tilt")))
+        td = env.maybe_reset(td)
+    speed = steps * env.num_envs / (time.perf_counter() - start)
+    middle, most = (torch.cat(depths) * 1000).quantile(torch.tensor([0.5, 0.99])).tolist()
+    minutes = steps * env.num_envs * env.config.physics.control_dt / 60
+    return f"{reward:11.2f} {collisions:15.3f} {falls / minutes:10.2f} {middle:13.1f} {most:8.1f} {speed:14.0f}"
 
 
 def main() -> None:
-    warnings.filterwarnings("ignore", category=FutureWarning, module="torchrl")
-
     def run() -> None:
         config = tyro.cli(SubstepsConfig, prog="python benchmarks/substeps.py")
-        loaded = load_networks(config.checkpoint, task="footstep", field="CHECKPOINT")
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            compare_trajectories(loaded, config)
-            compare_returns(loaded, config)
+        loaded = load_networks(config.checkpoint, field="CHECKPOINT")
+        print("terrain     substeps  reward/step  collisions/step  falls/min  depth [mm]: median, 99 %   steps/s")
+        for infill, height in ((1.0, 0.0), (0.9, 0.05)):
+            for substeps in config.substeps:
+                env = build(loaded, config, substeps, infill, height)
+                line = measure(env, loaded, round(config.seconds / env.config.physics.control_dt))
+                print(f"{infill:.0%} / {height * 100:g} cm {substeps:11d} {line}", flush=True)
 
     command_line(run)
 

@@ -51,7 +51,7 @@ def test_native_engine_is_bit_equal_to_mj_step(make_sim):
         readings = sim.step(control)
         for world, (model, data) in enumerate(zip(models, datas, strict=True)):
             data.ctrl[:] = control[world].numpy().astype(np.float64)
-            for _ in range(2):
+            for _ in range(sim.scene.physics.substeps):
                 mujoco.mj_step(model, data)
             assert np.array_equal(sim.qpos[world].numpy(), data.qpos)
             assert np.array_equal(sim.qvel[world].numpy(), data.qvel)
@@ -202,11 +202,22 @@ def test_a_reset_robot_meets_its_new_ground_at_once(make_sim):
     assert torch.equal(sim.step(stance(sim)).qvel, fresh.step(stance(fresh)).qvel)
 
 
-def test_four_substeps_agree_with_two_for_a_while(make_sim):
-    coarse, fine = make_sim(4), make_sim(4, substeps=4)
+def test_the_default_substeps_agree_with_twice_as_many_for_a_while(make_sim):
+    coarse, fine = make_sim(4), make_sim(4, substeps=8)
     for control in noisy_controls(coarse, 6, scale=0.05):
         a, b = coarse.step(control), fine.step(control)
     assert (a.base_position - b.base_position).abs().max() < 5e-3
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_ground_is_hard(make_sim, engine):
+    """After a fall from 5 cm the feet sink in by less than a third of their radius: the calves stay clear of the ground."""
+    sim = make_sim(1, engine=engine)
+    high = sim._home[None].clone()
+    high[0, 2] += 0.05
+    sim.reset(torch.tensor([0]), high)
+    lowest = min(sim.step(stance(sim)).foot_position[..., 2].min().item() for _ in range(30))
+    assert 0.0265 - 0.009 < lowest < 0.0265
 
 
 @pytest.mark.parametrize(
