@@ -139,7 +139,9 @@ def _best_response(value: GoalValue, own: PairCandidates, worlds: Tensor, other:
     Returns:
         Objectives, without the other pair's score, and indices, [K] each.
     """
-    if len(worlds) == 1 < len(own.score):  # a single matrix product rounds differently from several: see `FactoredValue`
+    if (
+        len(worlds) == 1 < len(own.score)
+    ):  # a single matrix product rounds differently from several: see `FactoredValue`
         objective, index = _best_response(value, own, worlds.repeat(2), other.repeat(2, 1))
         return objective[:1], index[:1]
     parts = -(-len(worlds) * own.score.shape[1] // ROWS_AT_ONCE)
