@@ -33,7 +33,7 @@ from quadhrl.trainers.checkpoint import load_networks
 class BenchmarkConfig:
     """Measure the searches of the high-level policy."""
 
-    checkpoint: str = "quadhrl/assets/footstep.torchrl"
+    checkpoint: str = "footstep"
     """Footstep policy whose critic and states are used."""
     worlds: tuple[int, ...] = (1, 12, 60)
     """Batch sizes to measure."""

@@ -31,8 +31,6 @@ from quadhrl.trainers.checkpoint import LoadedPolicy, find_checkpoint, load_netw
 
 __all__ = ["GridConfig", "main", "run_grid"]
 
-ASSETS = Path(__file__).parents[1] / "assets"
-
 
 @dataclass
 class GridConfig:
@@ -44,9 +42,9 @@ class GridConfig:
     """Rollouts per method and terrain."""
     methods: tuple[str, ...] = tuple(METHODS)
     """Methods to run: hlp, llp-random, llp-in-place, end-to-end."""
-    checkpoint_footstep: str = str(ASSETS / "footstep.torchrl")
+    checkpoint_footstep: str = "footstep"
     """Checkpoint or run directory of the low-level policy."""
-    checkpoint_forward: str = str(ASSETS / "forward.torchrl")
+    checkpoint_forward: str = "forward"
     """Checkpoint or run directory of the end-to-end policy."""
     infill: tuple[float, ...] = (1.0, 0.9, 0.8)
     """Infills of the terrains, 0 to 1."""

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictSequential
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
-from quadhrl.envs import ENVIRONMENTS
+from quadhrl.envs import ENVIRONMENTS, LocomotionEnv
 from quadhrl.envs.trajectory_generator import ACTION_DIM
 from quadhrl.errors import InputError
 from quadhrl.policies import ActorCritic
@@ -18,6 +20,7 @@ from quadhrl.trainers.config import TrainConfig, train_config_from_dict
 
 __all__ = [
     "FORMAT_VERSION",
+    "SHIPPED",
     "LoadedPolicy",
     "find_checkpoint",
     "load_networks",
@@ -25,6 +28,9 @@ __all__ = [
     "read_metadata",
     "rotation",
 ]
+
+SHIPPED = {path.stem: path for path in (Path(__file__).parents[1] / "assets").glob("*.torchrl")}
+"""The policies that come with the package, by name."""
 
 FORMAT_VERSION = 1
 """Version of the checkpoints' content; raise it when old files can no longer be read."""
@@ -38,6 +44,35 @@ class LoadedPolicy:
     config: TrainConfig
     metadata: dict[str, Any]
     """Samples, wall time and scores at the time of saving."""
+
+    @property
+    def policy(self) -> TensorDictSequential:
+        """Observations -> action [..., 15]; follows TorchRL's exploration type (deterministic: the mean)."""
+        return self.networks.policy()
+
+    @property
+    def value(self) -> TensorDictSequential:
+        """Observations -> ``state_value`` [..., 1], the expected discounted return in reward units."""
+        return self.networks.value()
+
+    def env(self, num_envs: int, *, seed: int = 0, engine: str = "auto", **terrain: float) -> LocomotionEnv:
+        """The environment that the policy was trained in, with the paper's episode ends and without a curriculum.
+
+        Args:
+            num_envs: number of worlds.
+            seed: seed of targets and terrains.
+            engine: physics engine: warp, native or auto.
+            terrain: fields of `quadhrl.sim.TerrainConfig` to change, such as ``infill`` and ``height_range``.
+
+        Raises:
+            InputError: an argument is out of its range.
+        """
+        config = copy.deepcopy(self.config.env)
+        config.curriculum.enabled = False
+        config.termination = type(config.termination)()
+        config.terrain = dataclasses.replace(config.terrain, **terrain)
+        device = next(self.networks.parameters()).device
+        return ENVIRONMENTS[self.config.task](config, num_envs, engine=engine, device=device, seed=seed)
 
 
 def build_networks(config: TrainConfig) -> ActorCritic:
@@ -56,12 +91,12 @@ def metadata(config: TrainConfig, **facts: Any) -> dict[str, Any]:
 
 
 def find_checkpoint(path: str | Path, field: str = "checkpoint") -> Path:
-    """The checkpoint file itself, or the newest one of a run directory.
+    """The checkpoint file itself, the newest one of a run directory, or a shipped policy by its name.
 
     Raises:
         InputError: there is none.
     """
-    path = Path(path)
+    path = SHIPPED.get(str(path), Path(path))
     if path.is_file():
         return path
     if path.is_dir():
@@ -69,7 +104,9 @@ def find_checkpoint(path: str | Path, field: str = "checkpoint") -> Path:
         if newest is not None:
             return newest
         raise InputError(field, str(path), "no checkpoint in this run directory; give another one")
-    raise InputError(field, str(path), "no such file or run directory; give the path of a checkpoint (*.torchrl)")
+    names = " or ".join(sorted(SHIPPED))
+    remedy = f"no such file or run directory; give the path of a checkpoint (*.torchrl), or one of the shipped: {names}"
+    raise InputError(field, str(path), remedy)
 
 
 def read_metadata(path: Path, field: str = "checkpoint") -> dict[str, Any]:
@@ -96,7 +133,7 @@ def load_networks(
     """Load the networks of a checkpoint file or of a run directory's newest checkpoint.
 
     Args:
-        path: checkpoint file or run directory.
+        path: checkpoint file, run directory, or name of a shipped policy.
         task: the task that it must have been trained for; None for any.
         device: where the networks go.
         field: what the user calls this input, for error messages.
