@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from quadhrl.envs import rewards
 from quadhrl.envs.curriculum import CurriculumConfig, TerrainCurriculum
 from quadhrl.envs.scan import SCAN_POINTS, scan, scan_pattern
+from quadhrl.envs.symmetry import Mirror
 from quadhrl.envs.threads import one_thread_for_small_batches
 from quadhrl.envs.trajectory_generator import ACTION_DIM, TrajectoryGenerator, TrajectoryGeneratorConfig
 from quadhrl.errors import check_range
@@ -100,6 +101,8 @@ class LocomotionEnv(EnvBase):
     """Names of the task's reward terms."""
     network_inputs: ClassVar[dict[str, int]]
     """Observation keys that policy and value function see, and their sizes, in input order."""
+    mirrors: ClassVar[dict[str, Mirror]]
+    """How each of them and the action look in a mirror (see `quadhrl.envs.symmetry`)."""
 
     def __init__(
         self,

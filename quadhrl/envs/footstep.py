@@ -13,6 +13,7 @@ from torchrl.data import Unbounded
 from quadhrl.envs import rewards
 from quadhrl.envs.base import LocomotionConfig, LocomotionEnv, SharedRewardConfig, TerminationConfig
 from quadhrl.envs.scan import SCAN_POINTS
+from quadhrl.envs.symmetry import ACTION, BODY, PHASE_AND_ACTIONS, SCAN, Mirror, entries, join, legs
 from quadhrl.envs.targets import FootstepTargets, TargetConfig
 from quadhrl.errors import check_range
 from quadhrl.rotations import rotate_yaw
@@ -87,6 +88,12 @@ class FootstepEnv(LocomotionEnv):
 
     config: FootstepConfig
     network_inputs: ClassVar[dict[str, int]] = {"proprioception": 80, "goal": 12, "scan": 4 * SCAN_POINTS}
+    mirrors: ClassVar[dict[str, Mirror]] = {
+        "proprioception": join(BODY, legs(entries(1)), PHASE_AND_ACTIONS),
+        "goal": join(legs(entries(1, -1)), entries(1, -1, 1, -1)),
+        "scan": SCAN,
+        "action": ACTION,
+    }
     reward_names = (
         "footstep_target",
         "velocity_towards_target",

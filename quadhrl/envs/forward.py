@@ -12,6 +12,7 @@ from torchrl.data import Unbounded
 from quadhrl.envs import rewards
 from quadhrl.envs.base import LocomotionConfig, LocomotionEnv, SharedRewardConfig
 from quadhrl.envs.scan import SCAN_POINTS
+from quadhrl.envs.symmetry import ACTION, BODY, PHASE_AND_ACTIONS, SCAN, Mirror, entries, join
 from quadhrl.errors import check_range
 from quadhrl.sim import Readings
 
@@ -60,6 +61,11 @@ class ForwardEnv(LocomotionEnv):
 
     config: ForwardConfig
     network_inputs: ClassVar[dict[str, int]] = {"proprioception": 77, "scan": 4 * SCAN_POINTS}
+    mirrors: ClassVar[dict[str, Mirror]] = {
+        "proprioception": join(BODY, entries(-1), PHASE_AND_ACTIONS),
+        "scan": SCAN,
+        "action": ACTION,
+    }
     reward_names = ("forward_velocity", "lateral_velocity", "smoothness", "foot_slip", "collision", "swing_phase")
 
     def _set_up_task(self) -> None:

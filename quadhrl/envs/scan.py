@@ -9,18 +9,19 @@ from torch import Tensor
 
 from quadhrl.sim import BlockTerrain
 
-__all__ = ["SCAN_POINTS", "scan", "scan_pattern"]
+__all__ = ["DIRECTIONS", "SCAN_POINTS", "scan", "scan_pattern"]
 
 _RADII = (0.025, 0.05, 0.075, 0.1, 0.125, 0.15, 0.2)
-_DIRECTIONS = 10
+DIRECTIONS = 10
+"""Points on each ring, the first one in the direction of the x axis."""
 
-SCAN_POINTS = 1 + len(_RADII) * _DIRECTIONS
+SCAN_POINTS = 1 + len(_RADII) * DIRECTIONS
 """Points around each foot: 71."""
 
 
 def scan_pattern(device: torch.device | str = "cpu") -> Tensor:
     """Offsets of the scan points from the foot's centre in world axes [m], [71, 2]: the centre, then rings outwards."""
-    angles = [2 * math.pi * k / _DIRECTIONS for k in range(_DIRECTIONS)]
+    angles = [2 * math.pi * k / DIRECTIONS for k in range(DIRECTIONS)]
     points = [(0.0, 0.0), *((r * math.cos(a), r * math.sin(a)) for r in _RADII for a in angles)]
     return torch.tensor(points, device=device)
 

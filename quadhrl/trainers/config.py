@@ -53,6 +53,8 @@ class PPOConfig:
     """Upper bound of the learning rate."""
     target_kl: float = 0.01
     """The learning rate falls by 1.5 when the KL divergence exceeds twice this, and rises by 1.5 below half of it."""
+    symmetry: bool = False
+    """Train on every sample a second time, as seen in a mirror that exchanges left and right."""
     max_grad_norm: float = 1.0
     """Gradients are scaled down to this norm."""
 

@@ -126,19 +126,23 @@ class PPOTrainer:
         explained = 1.0 - (target - batch["state_value"]).var() / target.var().clamp(min=1e-8)
         statistics.update(target)
         advantage = batch["advantage"]
-        data = batch.select("features", "action", "action_log_prob", "loc", "scale").reshape(-1)
+        data = batch.select("features", "action", "action_log_prob").reshape(-1)
         data["normalized_target"] = ((target - statistics.mean) / statistics.std).reshape(-1, 1)
         data["advantage"] = ((advantage - advantage.mean()) / advantage.std().clamp(min=1e-8)).reshape(-1, 1)
 
+        views = [data, self._mirrored(batch, data)] if ppo.symmetry else [data]
+
         # Shuffled once per batch, as in rsl_rl: gathering the rows anew for every pass costs more than it helps.
-        minibatches = data[torch.randperm(len(data), device=self.device)].chunk(ppo.minibatches)
+        order = torch.randperm(len(data), device=self.device)
+        minibatches = list(zip(*(view[order].chunk(ppo.minibatches) for view in views), strict=True))
         sums: dict[str, float] = {}
         updates = skipped = 0
         for _ in range(ppo.epochs):
             epoch_kl: list[float] = []
             for minibatch in minibatches:
-                losses = self.loss(minibatch)
-                loss = sum(value for key, value in losses.items() if key.startswith("loss_"))
+                seen = [self.loss(view) for view in minibatch]
+                loss = sum(value for losses in seen for key, value in losses.items() if key.startswith("loss_"))
+                loss, losses = loss / len(seen), seen[0]  # the divergence, too, is that of what was really sampled
                 self.optimizer.zero_grad()
                 loss.backward()
                 norm = torch.nn.utils.clip_grad_norm_(self.loss.parameters(), ppo.max_grad_norm)
@@ -162,6 +166,18 @@ class PPOTrainer:
             "update/skipped": float(skipped),
             "policy/std": networks.actor[0].module.log_std.exp().mean().item(),
         }
+
+    def _mirrored(self, batch: TensorDictBase, data: TensorDictBase) -> TensorDictBase:
+        """The rows of `update` as seen in a mirror: other features and actions, the same advantages and targets.
+
+        They were sampled by the policy's mirror image, so the probabilities of the actions that were taken stay as they are.
+        """
+        mirrors, networks = self.env.mirrors, self.networks
+        features = networks.normalizer.module(*(mirrors[key](batch[key]) for key in networks.observations))
+        mirrored = data.clone(recurse=False)
+        mirrored["features"] = features.reshape(len(data), -1)
+        mirrored["action"] = mirrors["action"](data["action"])
+        return mirrored
 
     @property
     def learning_rate(self) -> float:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from torchrl.checkpoint import CheckpointRotation
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from quadhrl.errors import InputError
 from quadhrl.eval.curves import plot_curves, read_scalars
@@ -265,3 +266,20 @@ def test_a_checkpoint_with_another_versions_state_is_refused(run, tmp_path):
     path = trainer.checkpoint().save(tmp_path / "old.ckpt")
     with pytest.raises(InputError, match="start a new run with --init-from"):
         PPOTrainer(tiny()).load(path)
+
+
+def test_symmetry_makes_the_policy_symmetric():
+    def asymmetry(*flags):
+        trainer = PPOTrainer(parse_command_line(args=["--preset", "smoke", "--ppo.learning-rate", "1e-3", *flags]))
+        for _ in range(8):
+            trainer.iterate()
+        batch = trainer._collect()
+        networks, mirrors = trainer.networks, trainer.env.mirrors
+        seen = batch.select(*networks.observations)
+        for key in networks.observations:
+            seen[key] = mirrors[key](seen[key])
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            action, image = (networks.policy()(x)["action"] for x in (batch.select(*networks.observations), seen))
+        return (mirrors["action"](image) - action).square().mean().sqrt()
+
+    assert asymmetry("--ppo.symmetry") < 0.5 * asymmetry()
