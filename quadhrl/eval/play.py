@@ -37,7 +37,7 @@ class PlayConfig:
     heading: float = 0.0
     """Direction of travel in the world with --hlp, 0 along x [degrees]."""
     video: str = ""
-    """Write a film of the first world to this file (.mp4)."""
+    """Write a film of the first world to this file (.mp4; or .gif, with fewer frames)."""
     picture: str = ""
     """Write the last frame to this file (.png)."""
     viewer: bool = False
@@ -62,8 +62,8 @@ class PlayConfig:
     """Height of the film [px]."""
 
 
-FRAME_STEPS = 2
-"""Control steps per frame: 30 frames a second."""
+FRAME_STEPS = {".mp4": 2, ".gif": 6}
+"""Control steps per frame: 30 and 10 frames a second."""
 
 
 def play(config: PlayConfig) -> dict[str, float]:
@@ -142,17 +142,23 @@ class _Film:
         self._renderer = WorldRenderer(env, 0, width=config.width, height=config.height)
         self._writer = None
         if config.video:
+            kind = Path(config.video).suffix
+            if kind not in FRAME_STEPS:
+                raise InputError("--video", config.video, f"choose a file that ends in {' or '.join(FRAME_STEPS)}")
+            self._frame_steps = FRAME_STEPS[kind]
+            seconds = env.config.physics.control_dt * self._frame_steps
             try:
                 import imageio.v2 as imageio
 
-                rate = round(1.0 / env.config.physics.control_dt / FRAME_STEPS)
-                self._writer = imageio.get_writer(config.video, fps=rate, macro_block_size=1, quality=7)
+                how = {"fps": round(1 / seconds), "macro_block_size": 1, "quality": 7}
+                how = how if kind == ".mp4" else {"duration": 1000 * seconds, "loop": 0}
+                self._writer = imageio.get_writer(config.video, **how)
             except (ImportError, OSError, ValueError) as error:
-                remedy = f"cannot write it ({error}); install quadhrl[video] and choose a writable .mp4 file"
+                remedy = f"cannot write it ({error}); install quadhrl[video] and choose a writable file"
                 raise InputError("--video", config.video, remedy) from error
 
     def show(self) -> None:
-        if self._writer is not None and self._steps % FRAME_STEPS == 0:
+        if self._writer is not None and self._steps % self._frame_steps == 0:
             self._writer.append_data(self._renderer.frame())
         self._steps += 1
 
