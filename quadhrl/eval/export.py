@@ -1,4 +1,7 @@
-"""A policy as one ONNX file, normaliser inside: ``python -m quadhrl.eval.export CHECKPOINT --out policy.onnx``."""
+"""A policy as one small file: ``python -m quadhrl.eval.export CHECKPOINT --out policy.onnx`` (or ``policy.torchrl``).
+
+The ONNX file holds the deterministic action with the normaliser; the other one networks and settings, for `quadhrl.load_policy`.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +15,19 @@ from torch import Tensor, nn
 
 from quadhrl.errors import InputError, command_line
 from quadhrl.policies import ActorCritic
-from quadhrl.trainers.checkpoint import load_networks
+from quadhrl.trainers.checkpoint import load_networks, save_networks
 
 __all__ = ["ExportConfig", "export_onnx", "main"]
 
 
 @dataclass
 class ExportConfig:
-    """Export a policy's deterministic action to ONNX."""
+    """Export a policy to a file of its own."""
 
     checkpoint: Annotated[str, tyro.conf.Positional]
     """Checkpoint file or run directory."""
     out: str = "policy.onnx"
-    """File to write."""
+    """File to write: .onnx for other runtimes, .torchrl for this package."""
 
 
 class _MeanAction(nn.Module):
@@ -75,7 +78,13 @@ def main() -> None:
         out = Path(config.out)
         if not out.absolute().parent.is_dir():
             raise InputError("--out", config.out, "its folder does not exist; create it or choose another")
-        export_onnx(load_networks(config.checkpoint, field="CHECKPOINT").networks, out)
+        loaded = load_networks(config.checkpoint, field="CHECKPOINT")
+        if out.suffix == ".onnx":
+            export_onnx(loaded.networks, out)
+        elif out.suffix == ".torchrl":
+            save_networks(loaded, out)
+        else:
+            raise InputError("--out", config.out, "choose a file that ends in .onnx or .torchrl")
         print(out.absolute())
 
     command_line(run)

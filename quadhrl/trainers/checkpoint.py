@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ __all__ = [
     "metadata",
     "read_metadata",
     "rotation",
+    "save_networks",
 ]
 
 SHIPPED = {path.stem: path for path in (Path(__file__).parents[1] / "assets").glob("*.torchrl")}
@@ -43,7 +45,7 @@ class LoadedPolicy:
     networks: ActorCritic
     config: TrainConfig
     metadata: dict[str, Any]
-    """Samples, wall time and scores at the time of saving."""
+    """Samples and wall time (of its run; ``total_`` with the runs that it began from), machine, and scores in training."""
 
     @property
     def policy(self) -> TensorDictSequential:
@@ -88,6 +90,20 @@ def rotation(directory: Path) -> CheckpointRotation:
 def metadata(config: TrainConfig, **facts: Any) -> dict[str, Any]:
     """A checkpoint's metadata: its format, the run's config, and facts such as samples and reward."""
     return {"quadhrl_format": FORMAT_VERSION, "task": config.task, "config": dataclasses.asdict(config), **facts}
+
+
+def save_networks(loaded: LoadedPolicy, out: Path) -> None:
+    """Write the networks alone, with config and metadata: a twentieth of a run's checkpoint, and all that `load_networks` needs.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    facts = {name: value for name, value in loaded.metadata.items() if name not in ("quadhrl_format", "task")}
+    config = dataclasses.replace(loaded.config, log_dir="logs", init_from="", resume="")  # paths of another machine
+    with tempfile.TemporaryDirectory(dir=out.absolute().parent) as folder:
+        file = Path(folder) / out.name
+        Checkpoint(format="archive", networks=loaded.networks).save(file, metadata=metadata(config, **facts))
+        file.replace(out)
 
 
 def find_checkpoint(path: str | Path, field: str = "checkpoint") -> Path:

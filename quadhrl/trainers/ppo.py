@@ -27,7 +27,7 @@ from quadhrl.trainers.advantage import add_advantages
 from quadhrl.trainers.checkpoint import build_networks, find_checkpoint, load_networks, read_metadata
 from quadhrl.trainers.config import TrainConfig, flag_value, parse_command_line
 from quadhrl.trainers.progress import TrainingProgress
-from quadhrl.trainers.run_directory import RunDirectory, read_run_config
+from quadhrl.trainers.run_directory import RunDirectory, describe_machine, read_run_config
 from quadhrl.trainers.statistics import rollout_statistics
 
 __all__ = ["PPOTrainer", "main"]
@@ -54,8 +54,13 @@ class PPOTrainer:
         torch.manual_seed(config.seed)
         environment = ENVIRONMENTS[config.task]
         self.env = environment(config.env, config.num_envs, engine=config.engine, device=self.device, seed=config.seed)
+        self.inherited = {"samples": 0, "wall_seconds": 0.0}
+        """What had gone into the networks of ``--init-from``."""
         if config.init_from:
-            self.networks = load_networks(config.init_from, task=config.task, field="--init-from").networks.train()
+            loaded = load_networks(config.init_from, task=config.task, field="--init-from")
+            self.networks = loaded.networks.train()
+            for name in self.inherited:
+                self.inherited[name] = loaded.metadata.get(f"total_{name}", loaded.metadata.get(name, 0))
         else:
             self.networks = build_networks(config)
         self.networks.to(self.device)
@@ -195,6 +200,16 @@ class PPOTrainer:
             position=self,
         )
 
+    def history(self) -> dict[str, Any]:
+        """What has gone into the networks, for the checkpoint's metadata."""
+        inherited = self.inherited
+        return {
+            "wall_seconds": self.wall_seconds,
+            "total_samples": inherited["samples"] + self.samples,
+            "total_wall_seconds": inherited["wall_seconds"] + self.wall_seconds,
+            "machine": describe_machine(self.device),
+        }
+
     def state_dict(self) -> dict[str, Any]:
         """The run's position, beside what has a state of its own."""
         return {
@@ -202,12 +217,14 @@ class PPOTrainer:
             "wall_seconds": self.wall_seconds,
             "recent_rewards": self.recent_rewards,
             "max_reward": self.max_reward,
+            "inherited": self.inherited,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the run's position."""
         self.samples, self.wall_seconds = int(state["samples"]), float(state["wall_seconds"])
         self.recent_rewards, self.max_reward = list(state["recent_rewards"]), float(state["max_reward"])
+        self.inherited = state.get("inherited", self.inherited)
 
     def load(self, path: Any) -> None:
         """Carry on exactly where the checkpoint was saved.
@@ -271,7 +288,7 @@ def train(config: TrainConfig) -> None:
 
     def save() -> None:
         facts = latest | ({"max_reward": trainer.max_reward} if math.isfinite(trainer.max_reward) else {})
-        directory.save(checkpoint, trainer.samples, wall_seconds=trainer.wall_seconds, **facts)
+        directory.save(checkpoint, trainer.samples, **trainer.history(), **facts)
 
     checkpoint = trainer.checkpoint()
     began = last_save = time.monotonic()

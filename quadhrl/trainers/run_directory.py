@@ -5,11 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import os
+import platform
 import subprocess
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import torch
 from torchrl.checkpoint import Checkpoint
 from torchrl.record.loggers import get_logger
 
@@ -87,6 +90,18 @@ def read_run_config(path: str) -> TrainConfig:
     except (OSError, ValueError) as error:
         raise InputError("--resume", str(file), "the file is damaged; restore it") from error
     return train_config_from_dict(values, where=f"--resume {file}")
+
+
+def describe_machine(device: torch.device) -> str:
+    """The GPU's name, or the processor's with the number of its cores."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        name = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        name = platform.processor() or platform.machine()
+    return f"{name}, {os.cpu_count()} cores"
 
 
 def _git_state() -> str:

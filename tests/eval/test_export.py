@@ -5,8 +5,10 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+import quadhrl
 from quadhrl.eval.export import export_onnx
 from quadhrl.policies import ActorCritic
+from quadhrl.trainers.checkpoint import save_networks
 
 
 def test_onnx_policy_gives_the_same_actions(tmp_path):
@@ -22,6 +24,16 @@ def test_onnx_policy_gives_the_same_actions(tmp_path):
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         expected = networks.policy()(dict_to_td(networks, observations))["action"].clamp(-1, 1)
     assert np.allclose(action, expected.numpy(), atol=1e-5)
+
+
+def test_networks_alone_load_like_the_checkpoint(tmp_path):
+    source = quadhrl.load_policy("footstep")
+    save_networks(source, tmp_path / "policy.torchrl")
+    again = quadhrl.load_policy(tmp_path / "policy.torchrl")
+    assert [path.name for path in tmp_path.iterdir()] == ["policy.torchrl"]
+    assert again.metadata == source.metadata and again.config.env == source.config.env
+    for name, tensor in source.networks.state_dict().items():
+        assert torch.equal(again.networks.state_dict()[name], tensor), name
 
 
 def dict_to_td(networks, observations):

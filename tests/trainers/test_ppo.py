@@ -283,3 +283,11 @@ def test_symmetry_makes_the_policy_symmetric():
         return (mirrors["action"](image) - action).square().mean().sqrt()
 
     assert asymmetry("--ppo.symmetry") < 0.5 * asymmetry()
+
+
+def test_history_counts_what_the_run_began_from(run, tmp_path):
+    train(tiny("--total-steps", "80", "--log-dir", str(tmp_path), "--run-name", "next", "--init-from", str(run)))
+    first, then = (load_networks(folder).metadata for folder in (run, tmp_path / "next"))
+    assert (first["total_samples"], then["samples"], then["total_samples"]) == (160, 80, 240)
+    assert then["total_wall_seconds"] == pytest.approx(first["wall_seconds"] + then["wall_seconds"])
+    assert then["machine"].endswith("cores")
