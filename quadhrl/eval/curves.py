@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Annotated
 
 import matplotlib
+import numpy as np
 import tyro
+from scipy.ndimage import uniform_filter1d
 
 from quadhrl.errors import InputError, command_line
 
@@ -20,6 +22,9 @@ PANELS = {
     "rollout/falls_per_minute": "falls per robot-minute",
     "curriculum/level": "mean terrain level",
 }
+
+SMOOTHED = 25
+"""Updates that a point of the thick curves is the mean of."""
 
 
 @dataclass
@@ -57,15 +62,22 @@ def plot_curves(runs: list[Path], out: Path) -> Path:
     import matplotlib.pyplot as plt
 
     scalars = {run.name: read_scalars(run) for run in runs}
-    figure, axes = plt.subplots(1, len(PANELS), figsize=(4.2 * len(PANELS), 3.4), constrained_layout=True)
-    for axis, (name, title) in zip(axes, PANELS.items(), strict=True):
-        for run, values in scalars.items():
-            points = values.get(name, [])
-            axis.plot([step / 1e6 for step, _ in points], [value for _, value in points], label=run, linewidth=1.2)
-        axis.set(title=title, xlabel="samples [M]")
+    varied = [
+        name for name in PANELS if any(np.ptp([y for _, y in run.get(name, [(0, 0)])]) for run in scalars.values())
+    ]
+    figure, axes = plt.subplots(
+        1, len(varied), figsize=(4.2 * len(varied), 3.4), constrained_layout=True, squeeze=False
+    )
+    for axis, name in zip(axes[0], varied, strict=True):
+        for number, (run, values) in enumerate(scalars.items()):
+            steps, points = np.array(values.get(name, [])).reshape(-1, 2).T
+            smooth = uniform_filter1d(points, SMOOTHED, mode="nearest")
+            axis.plot(steps / 1e6, points, color=f"C{number}", linewidth=0.6, alpha=0.25)
+            axis.plot(steps / 1e6, smooth, color=f"C{number}", linewidth=1.4, label=run)
+        axis.set(title=PANELS[name], xlabel="samples [M]")
         axis.grid(alpha=0.3)
     if len(runs) > 1:
-        axes[0].legend(frameon=False)
+        axes[0, 0].legend(frameon=False)
     figure.savefig(out, dpi=130)
     plt.close(figure)
     table = out.with_suffix(".csv")
