@@ -214,7 +214,7 @@ def _facts(
             "falls_per_minute": sum(e.outcome == "fall" for e in episodes) / minutes,
             "pairs_per_second": sum(e.pairs for e in episodes) / minutes / 60.0,
             "metres_per_second": sum(e.distance for e in episodes) / minutes / 60.0,
-            "samples": loaded.metadata.get("samples"),
+            "samples": loaded.metadata.get("total_samples", loaded.metadata.get("samples")),
         }
     return {
         "rollouts": config.rollouts,
