@@ -97,8 +97,11 @@ def main(config: BenchmarkConfig) -> None:
     """Run the benchmark and print the result."""
     device = resolve_device(config.device)
     networks = load_networks(config.checkpoint, task="footstep", device=device, field="--checkpoint").networks
-    if config.states < max(config.worlds):
-        raise InputError("--states", config.states, f"give at least as many as the largest batch, {max(config.worlds)}")
+    least = max(MEASURED, *config.worlds)
+    if config.states < least:
+        raise InputError(
+            "--states", config.states, f"give at least {least}: the largest batch and the single solves take these"
+        )
     states = record_states(networks, config.states, device)
     exact, alternating = (solve(networks, states, search) for search in ("exact", "alternating"))
     gap = (exact - alternating).clamp(min=0.0)

@@ -59,7 +59,7 @@ def measure(engine: str, config: BenchmarkConfig) -> dict[str, float]:
     """Control steps per second of one engine's layers."""
     device = resolve_device(config.device) if engine == "warp" else torch.device("cpu")
     worlds = config.worlds if engine == "native" or device.type == "cuda" else config.warp_cpu_worlds
-    train: TrainConfig = PRESETS["cpu"]()
+    train: TrainConfig = PRESETS["cpu"]("footstep")
     train.engine, train.device, train.num_envs, train.init_from = engine, str(device), worlds, config.checkpoint
     train.ppo.horizon, train.env.curriculum.enabled = config.horizon, False
     train.env.terrain.infill, train.env.terrain.height_range = config.infill, config.height_range
