@@ -67,4 +67,4 @@ def test_report_in_a_browser(report, browser, width):
 
 def test_report_is_one_file_without_links(report):
     page = report.read_text()
-    assert "http" not in page and "<script" not in page and page.count("data:image/png;base64,") == 4
+    assert "://" not in page and "<script" not in page and page.count("data:image/png;base64,") == 4
