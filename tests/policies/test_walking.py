@@ -51,8 +51,8 @@ def test_without_the_directional_term_it_hardly_gets_anywhere(networks):
 def test_it_walks_sideways_and_turns_when_the_heading_changes(networks):
     """Two worlds with headings of their own, exchanged in mid-run, with the square box of the paper's text.
 
-    The default box, a third as wide as long, allows 0.15 m/s sideways; there the value's own wish for steps forward or backward is of
-    the same size.
+    The default box, a third as wide as long, allows 0.15 m/s sideways; the value's own wish for steps forward or backward is of
+    the same size there.
     """
     env = make_env(2, infill=1.0, height_range=0.0)
     hlp = HighLevelPolicy(networks.value(), HighLevelConfig(lateral_ratio=1.0))
