@@ -15,7 +15,7 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
         (
             "throughput",
             ["--engines", "native", "--worlds", "4", "--horizon", "4", "--repeats", "1", "--json"],
-            "collection",
+            "env_step",
         ),
         ("substeps", ["forward", "--substeps", "4", "--worlds", "4", "--seconds", "0.3"], "90% / 5 cm"),
         ("holes", ["--worlds", "4", "--seconds", "0.5"], "on a block"),
