@@ -44,14 +44,9 @@ CLASSES = {"on a block": 0.0, "up to 4 cm off": 0.04, "up to 7.5 cm off": 0.075,
 
 def distance_to_ground(env: FootstepEnv) -> Tensor:
     """Distance of the active pair's farther target from the nearest block [N], m; at most the size of a block."""
-    size = env.terrain.config.block_size
-    target = env.targets.position
-    corner = (target / size).floor() * size
-    around = torch.tensor([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)], device=env.device) * size
-    low = corner[:, :, None] + around  # of the nine blocks under and around each target
-    solid = env.terrain.heights(low + size / 2) > -0.5 * env.terrain.config.gap_depth
-    beside = (low - target[:, :, None]).maximum(target[:, :, None] - low - size).clamp(min=0.0)
-    nearest = torch.where(solid, beside.norm(dim=-1), size).amin(-1)
+    target, terrain = env.targets.position, env.terrain
+    ground = terrain.nearest_ground(target)
+    nearest = torch.where(terrain.over_gap(ground), terrain.config.block_size, (ground - target).norm(dim=-1))
     return torch.where(env.targets.active, nearest, 0.0).amax(-1)
 
 

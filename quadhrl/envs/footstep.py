@@ -108,7 +108,7 @@ class FootstepEnv(LocomotionEnv):
 
     def _set_up_task(self) -> None:
         self.config.rewards.validate()
-        self.targets = FootstepTargets(self.config.targets, self.nominal_feet, self.num_envs)
+        self.targets = FootstepTargets(self.config.targets, self.nominal_feet, self.terrain)
         self.steps_since_hit = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         """Control steps since the last pair was hit, or since the episode began [N]."""
         self._stuck_steps = round(self.config.termination.stuck_seconds / self.config.physics.control_dt)
@@ -133,7 +133,7 @@ class FootstepEnv(LocomotionEnv):
         }
 
     def _reset_task(self, worlds: Tensor) -> None:
-        self.targets.reset(worlds, self.terrain.key[worlds])
+        self.targets.reset(worlds)
         self.steps_since_hit[worlds] = 0
 
     def _episode_score(self, worlds: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from quadhrl.errors import check_range
 from quadhrl.hashing import hash_key, hash_uniform
+from quadhrl.sim import BlockTerrain
 
 __all__ = ["FootstepTargets", "TargetConfig"]
 
@@ -29,6 +30,8 @@ class TargetConfig:
     """Every target is shifted by U(-this, this) in x and in y [m]."""
     ramp_pairs: int = 10
     """Pairs over which the shift grows from 0 to its full size; 1 for full shifts from the start."""
+    on_blocks: bool = False
+    """Move targets that lie over a gap to the nearest block; in the paper they stay where they are drawn."""
     lateral_ratio: float = 0.33
     """Step length sideways relative to forward: an ellipse over the heading; 1 for a circle."""
 
@@ -51,12 +54,13 @@ class FootstepTargets:
     Args:
         config: how sequences are drawn.
         nominal: nominal foot positions around the origin [m], [4, 2].
-        num_worlds: number of worlds, N.
+        terrain: the worlds that the targets lie in, N of them.
     """
 
-    def __init__(self, config: TargetConfig, nominal: Tensor, num_worlds: int) -> None:
+    def __init__(self, config: TargetConfig, nominal: Tensor, terrain: BlockTerrain) -> None:
         config.validate()
-        self.config, self._nominal = config, nominal
+        self.config, self._nominal, self._terrain = config, nominal, terrain
+        num_worlds = terrain.num_worlds
         device = nominal.device
         self.index = torch.ones(num_worlds, dtype=torch.long, device=device)
         """Number of the active pair [N]; odd: (FR, RL), even: (FL, RR)."""
@@ -83,14 +87,13 @@ class FootstepTargets:
         """Indices of the stance pair's feet, front foot first [N, 2]."""
         return self._pairs[(self.index + 1) % 2]
 
-    def reset(self, worlds: Tensor, key: Tensor) -> None:
-        """Draw new sequences, starting from the nominal places around the origin.
+    def reset(self, worlds: Tensor) -> None:
+        """Draw new sequences, starting from the nominal places around the origin; each follows from its terrain's key.
 
         Args:
             worlds: the worlds, [K].
-            key: what all of each sequence follows from, [K], int64.
         """
-        self._key[worlds] = key
+        self._key[worlds] = key = self._terrain.key[worlds]
         draws = hash_uniform(hash_key(key, 0), 2)
         length = draws[:, 0] * self.config.max_step
         heading = (2.0 * draws[:, 1] - 1.0) * torch.pi * self.config.max_heading / 180.0
@@ -148,4 +151,5 @@ class FootstepTargets:
         ramp = ((number - 1) / max(self.config.ramp_pairs - 1, 1)).clamp(max=1.0) if self.config.ramp_pairs > 1 else 1.0
         scale = self.config.max_shift * torch.as_tensor(ramp, device=device).expand(len(number))
         nominal = self._nominal[self._pairs[number % 2]]
-        return nominal + ((number - 1)[:, None] * self._step)[:, None] + scale[:, None, None] * shift
+        drawn = nominal + ((number - 1)[:, None] * self._step)[:, None] + scale[:, None, None] * shift
+        return self._terrain.nearest_ground(drawn) if self.config.on_blocks else drawn

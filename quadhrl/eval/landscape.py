@@ -70,7 +70,7 @@ def _telling(env: FootstepEnv, policy: HighLevelPolicy, td: TensorDictBase) -> t
     moved = (way[-1][0] - way[0][0])[:, 0].norm(dim=-1)  # [N, 2], m
     side = torch.linspace(-0.19, 0.19, 20)
     around = problem.centre[:, 0, :, None] + torch.cartesian_prod(side, side)  # [N, 2, 400, 2]
-    gaps = (env.terrain.heights(around) < -0.5 * env.terrain.config.gap_depth).float().mean(-1)
+    gaps = env.terrain.over_gap(around).float().mean(-1)
     gaps[env.step_count < STEPS] = 9.0  # robots that have fallen and begun anew
     k = int(((gaps - 1.0 / 3.0).abs() - 10.0 * moved).argmin())
     return k // 2, k % 2
@@ -100,9 +100,7 @@ def _draw(
     index = torch.tensor([world])
     for i in range(int(low[0]), int(high[0]) + 1):
         for j in range(int(low[1]), int(high[1]) + 1):
-            gap = (
-                env.terrain.block_heights(torch.tensor([[[i, j]]]), index).item() < -0.5 * env.terrain.config.gap_depth
-            )
+            gap = env.terrain.over_gap((torch.tensor([[[i, j]]]) + 0.5) * size, index).item()
             style = {"facecolor": (0, 0, 0, 0.35), "hatch": "xx"} if gap else {"facecolor": "none"}
             axis.add_patch(Rectangle((i * size, j * size), size, size, edgecolor="white", linewidth=0.8, **style))
     grid = (centre + offsets).unique(dim=0)

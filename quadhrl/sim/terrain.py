@@ -148,6 +148,31 @@ class BlockTerrain:
         """
         return self._look_up(blocks[..., 0].int(), blocks[..., 1].int(), worlds)
 
+    def over_gap(self, xy: Tensor, worlds: Tensor | None = None) -> Tensor:
+        """Whether positions lie over a gap, [K, ...] bool; arguments as for `heights`."""
+        return self.heights(xy, worlds) == -self.config.gap_depth
+
+    def nearest_ground(self, xy: Tensor, worlds: Tensor | None = None) -> Tensor:
+        """The nearest position over one of the nine blocks at and around each position, or the position itself if all are missing.
+
+        Args:
+            xy: world positions [m], [K, ..., 2].
+            worlds: the worlds they lie in, [K]; None for all.
+
+        Returns:
+            [K, ..., 2], m: the position itself where there is a block, else 0.1 mm inside of a block's edge.
+        """
+        size, inside = self.config.block_size, 1e-4
+        offsets = torch.tensor([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)], device=self.device) * size
+        low = (torch.floor(xy / size) * size)[..., None, :] + offsets
+        gap = self.over_gap(low + size / 2, worlds)
+        candidate = xy[..., None, :].clamp(low + inside, low + size - inside)
+        distance = (candidate - xy[..., None, :]).norm(dim=-1).masked_fill(gap, torch.inf)
+        nearest = distance.argmin(-1, keepdim=True)
+        chosen = candidate.gather(-2, nearest[..., None].expand(*nearest.shape, 2)).squeeze(-2)
+        stays = ~self.over_gap(xy, worlds) | gap.all(-1)
+        return torch.where(stays[..., None], xy, chosen)
+
     def _look_up(self, i: Tensor, j: Tensor, worlds: Tensor | None) -> Tensor:
         """Table entries of the blocks (i, j), int32 [K, ...] each; overwrites ``i`` and ``j``."""
         worlds = self._everyone if worlds is None else worlds.int()

@@ -147,6 +147,22 @@ def test_feet_do_not_sink_into_the_seams_of_level_ground(make_sim, engine):
     assert lowest > -0.03
 
 
+def test_nearest_ground_against_a_search_over_fine_points():
+    terrain = everywhere(BlockTerrain(TerrainConfig(infill=0.5), 2, seed=3))
+    random = torch.Generator().manual_seed(0)
+    xy = 2.0 * torch.rand(2, 200, 2, generator=random) + 1.0
+    side = torch.arange(-0.2, 0.2, 0.004)
+    around = xy[:, :, None] + torch.cartesian_prod(side, side)  # [2, 200, 10000, 2]
+    distance = (around - xy[:, :, None]).norm(dim=-1).masked_fill(terrain.over_gap(around), torch.inf).amin(-1)
+    found = terrain.nearest_ground(xy)
+    gap = terrain.over_gap(xy)
+    assert torch.equal(found[~gap], xy[~gap])
+    reachable = gap & distance.isfinite()
+    assert reachable.sum() > 100 and not terrain.over_gap(found)[reachable].any()
+    moved = (found - xy).norm(dim=-1)
+    assert (moved - distance)[reachable].abs().max() < 0.006, "the points are 4 mm apart"
+
+
 @pytest.mark.parametrize(
     ("field", "value", "flag"),
     [
