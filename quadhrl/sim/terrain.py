@@ -153,7 +153,7 @@ class BlockTerrain:
         return self.heights(xy, worlds) == -self.config.gap_depth
 
     def nearest_ground(self, xy: Tensor, worlds: Tensor | None = None) -> Tensor:
-        """The nearest position over one of the nine blocks at and around each position, or the position itself if all are missing.
+        """The nearest position over one of the nine blocks at and around each position; itself if all nine are missing.
 
         Args:
             xy: world positions [m], [K, ..., 2].
