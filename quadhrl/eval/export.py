@@ -46,7 +46,8 @@ def export_onnx(networks: ActorCritic, out: Path) -> None:
     """Write the policy to ``out``: one input [N, size] per observation key, by its name, and the output ``action`` [N, 15].
 
     Raises:
-        InputError: the onnx extra is not installed, or the file cannot be written.
+        InputError: the onnx extra is not installed.
+        OSError: the file cannot be written.
     """
     names = list(networks.observations)
     example = tuple(torch.zeros(2, size) for size in networks.observations.values())
@@ -64,10 +65,7 @@ def export_onnx(networks: ActorCritic, out: Path) -> None:
     except ImportError as error:
         raise InputError("--out", str(out), "ONNX is not installed; install quadhrl[onnx]") from error
     assert program is not None
-    try:
-        program.save(out, external_data=False)
-    except OSError as error:
-        raise InputError("--out", str(out), f"cannot write it ({error.strerror}); choose another file") from error
+    program.save(out, external_data=False)
 
 
 def main() -> None:
@@ -79,12 +77,15 @@ def main() -> None:
         if not out.absolute().parent.is_dir():
             raise InputError("--out", config.out, "its folder does not exist; create it or choose another")
         loaded = load_networks(config.checkpoint, field="CHECKPOINT")
-        if out.suffix == ".onnx":
-            export_onnx(loaded.networks, out)
-        elif out.suffix == ".torchrl":
-            save_networks(loaded, out)
-        else:
-            raise InputError("--out", config.out, "choose a file that ends in .onnx or .torchrl")
+        try:
+            if out.suffix == ".onnx":
+                export_onnx(loaded.networks, out)
+            elif out.suffix == ".torchrl":
+                save_networks(loaded, out)
+            else:
+                raise InputError("--out", config.out, "choose a file that ends in .onnx or .torchrl")
+        except OSError as error:
+            raise InputError("--out", config.out, f"cannot write it ({error.strerror}); choose another file") from error
         print(out.absolute())
 
     command_line(run)

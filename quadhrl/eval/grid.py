@@ -194,7 +194,7 @@ def _normalizers(folder: ResultsFolder, policies: dict[str, LoadedPolicy]) -> di
     result = {}
     for task, loaded in policies.items():
         rewards = [e.reward / e.steps for e in folder.episodes if e.method == f"training-{task}"]
-        trained = loaded.metadata.get("max_reward", loaded.metadata.get("reward"))
+        trained = loaded.metadata.get("max_reward")
         deterministic = sum(rewards) / len(rewards)
         result[task] = Normalizer(deterministic, float(deterministic if trained is None else trained))
     return result

@@ -46,6 +46,8 @@ class PPOTrainer:
     """
 
     RECENT = 16
+    WARM_UP = 10.0
+    """Robots begin together, on level ground and with easy targets: rewards of this time [s] are no measure of a policy."""
 
     def __init__(self, config: TrainConfig) -> None:
         config.validate()
@@ -90,7 +92,7 @@ class PPOTrainer:
         self.samples = 0
         """Samples trained on so far."""
         self.recent_rewards: list[float] = []
-        """Reward per control step of the last updates, at most `RECENT` of them."""
+        """Reward per control step of the last updates after `WARM_UP`, at most `RECENT` of them."""
         self.max_reward = -math.inf
         """Largest mean of `recent_rewards` so far, once there are `RECENT`."""
         self.wall_seconds = 0.0
@@ -108,7 +110,8 @@ class PPOTrainer:
         # Only now: the update must see the same features as the collection did, or its ratios would not begin at 1.
         self._update_normalizer(batch)
         self.samples += batch.numel()
-        self.recent_rewards = [*self.recent_rewards[1 - self.RECENT :], scalars["rollout/reward"]]
+        if self.samples / self.config.num_envs * self.config.env.physics.control_dt > self.WARM_UP:
+            self.recent_rewards = [*self.recent_rewards[1 - self.RECENT :], scalars["rollout/reward"]]
         if len(self.recent_rewards) == self.RECENT:
             self.max_reward = max(self.max_reward, sum(self.recent_rewards) / self.RECENT)
         ended = time.perf_counter()
@@ -201,9 +204,12 @@ class PPOTrainer:
         )
 
     def history(self) -> dict[str, Any]:
-        """What has gone into the networks, for the checkpoint's metadata."""
-        inherited = self.inherited
-        return {
+        """What has gone into the networks and what they reached, for the checkpoint's metadata."""
+        inherited, recent = self.inherited, self.recent_rewards
+        reached = {"reward": sum(recent) / len(recent) if recent else 0.0}  # 0: nothing is known before `WARM_UP`
+        if math.isfinite(self.max_reward):
+            reached["max_reward"] = self.max_reward
+        return reached | {
             "wall_seconds": self.wall_seconds,
             "total_samples": inherited["samples"] + self.samples,
             "total_wall_seconds": inherited["wall_seconds"] + self.wall_seconds,
@@ -284,11 +290,9 @@ def train(config: TrainConfig) -> None:
         trainer.load(resume_from)
     directory = RunDirectory(config)
     stop = _StopRequest()
-    latest = {"reward": -math.inf}
 
     def save() -> None:
-        facts = latest | ({"max_reward": trainer.max_reward} if math.isfinite(trainer.max_reward) else {})
-        directory.save(checkpoint, trainer.samples, **trainer.history(), **facts)
+        directory.save(checkpoint, trainer.samples, **trainer.history())
 
     checkpoint = trainer.checkpoint()
     began = last_save = time.monotonic()
@@ -299,7 +303,6 @@ def train(config: TrainConfig) -> None:
             if config.max_minutes and time.monotonic() - began > 60.0 * config.max_minutes:
                 break
             scalars = trainer.iterate()
-            latest = {"reward": scalars["rollout/reward"]}
             directory.log(scalars, trainer.samples)
             progress.update(trainer.samples, scalars)
             if time.monotonic() - last_save > 60.0 * config.checkpoint_minutes:

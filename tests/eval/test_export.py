@@ -6,7 +6,7 @@ import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import quadhrl
-from quadhrl.eval.export import export_onnx
+from quadhrl.eval.export import export_onnx, main
 from quadhrl.policies import ActorCritic
 from quadhrl.trainers.checkpoint import save_networks
 
@@ -34,6 +34,15 @@ def test_networks_alone_load_like_the_checkpoint(tmp_path):
     assert again.metadata == source.metadata and again.config.env == source.config.env
     for name, tensor in source.networks.state_dict().items():
         assert torch.equal(again.networks.state_dict()[name], tensor), name
+
+
+@pytest.mark.parametrize("name", ["policy.onnx", "policy.torchrl"])
+def test_a_file_that_cannot_be_written_is_one_clear_line(tmp_path, capsys, monkeypatch, name):
+    (tmp_path / name / "occupied").mkdir(parents=True)  # a folder of that name
+    monkeypatch.setattr("sys.argv", ["export", "footstep", "--out", str(tmp_path / name)])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2 and "--out: got" in capsys.readouterr().err
 
 
 def dict_to_td(networks, observations):
