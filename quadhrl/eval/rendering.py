@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 
 import mujoco
@@ -12,6 +13,9 @@ from quadhrl.errors import InputError
 from quadhrl.eval.world_view import Disc, WorldView
 
 __all__ = ["WorldRenderer"]
+
+LAG = 0.3
+"""The camera follows the robot by this much time [s], so that its steps do not shake the picture."""
 
 
 class WorldRenderer:
@@ -42,15 +46,19 @@ class WorldRenderer:
         self._options.geomgroup[:] = [1, 1, 1, 0, 0, 0]  # group 3: collision shapes, which would hide the visual ones
         self._camera = mujoco.MjvCamera()
         self._camera.distance, self._camera.azimuth, self._camera.elevation = 1.9, 125.0, -22.0
-        self._look_at: np.ndarray | None = None
+        self._env, self._world = env, world
+        self._look_at = np.zeros(3)
+        self._step = -1  # of the last frame
 
     def frame(self) -> np.ndarray:
         """The present state as a picture, [height, width, 3] uint8."""
         self.view.update()
         base = np.array([*self.view.data.qpos[:2], 0.2])
-        if self._look_at is None or np.linalg.norm(base - self._look_at) > 1.0:  # a new episode
-            self._look_at = base
-        self._look_at = 0.92 * self._look_at + 0.08 * base
+        step = int(self._env.step_count[self._world])
+        new = self._step < 0 or step < self._step  # the first episode, or the next one
+        elapsed = (step - self._step) * self._env.config.physics.control_dt
+        kept = 0.0 if new else math.exp(-elapsed / LAG)
+        self._look_at, self._step = kept * self._look_at + (1.0 - kept) * base, step
         self._camera.lookat[:] = self._look_at
         self._renderer.update_scene(self.view.data, self._camera, self._options)
         for disc in self.view.discs():
