@@ -15,7 +15,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from quadhrl.envs import FootstepEnv
+from quadhrl.envs import FootstepConfig, FootstepEnv
 from quadhrl.errors import InputError, command_line
 from quadhrl.eval.methods import mean_action
 
@@ -30,6 +30,8 @@ class HolesConfig:
     """Probability that a terrain block is present."""
     height_range: float = 0.05
     """Height range of the terrain blocks [m]."""
+    on_blocks: bool = False
+    """Move targets that lie over a gap to the nearest block, whatever the policy was trained with."""
     worlds: int = 256
     """Number of worlds."""
     seconds: float = 20.0
@@ -54,6 +56,8 @@ def distance_to_ground(env: FootstepEnv) -> Tensor:
 def main(config: HolesConfig) -> None:
     """Run and print the table."""
     loaded = quadhrl.load_policy(config.checkpoint)
+    if isinstance(loaded.config.env, FootstepConfig):
+        loaded.config.env.targets.on_blocks = config.on_blocks
     env = loaded.env(config.worlds, seed=config.seed, infill=config.infill, height_range=config.height_range)
     if not isinstance(env, FootstepEnv):
         raise InputError("CHECKPOINT", config.checkpoint, "it has no targets; give a footstep policy")

@@ -6,7 +6,6 @@ ground and on the training terrain. Contacts take their stiffness from the time 
 
 from __future__ import annotations
 
-import copy
 import sys
 import time
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ import quadhrl  # noqa: F401  (before torch: see there)  # isort: skip
 import torch
 import tyro
 
-from quadhrl.envs import ENVIRONMENTS, LocomotionEnv
+from quadhrl.envs import LocomotionEnv
 from quadhrl.errors import command_line
 from quadhrl.eval.methods import mean_action
 from quadhrl.trainers.checkpoint import LoadedPolicy, load_networks
@@ -36,14 +35,6 @@ class SubstepsConfig:
     """Simulated time of each rollout [s]."""
     seed: int = 0
     """Seed of targets and terrains."""
-
-
-def build(loaded: LoadedPolicy, config: SubstepsConfig, substeps: int, infill: float, height: float) -> LocomotionEnv:
-    settings = copy.deepcopy(loaded.config.env)
-    settings.physics.substeps, settings.curriculum.enabled = substeps, False
-    settings.terrain.infill, settings.terrain.height_range = infill, height
-    settings.termination = type(settings.termination)()
-    return ENVIRONMENTS[loaded.config.task](settings, config.worlds, seed=config.seed)
 
 
 @torch.no_grad()
@@ -76,7 +67,8 @@ def main() -> None:
         print("terrain     substeps  reward/step  collisions/step  falls/min  depth [mm]: median, 99 %   steps/s")
         for infill, height in ((1.0, 0.0), (0.9, 0.05)):
             for substeps in config.substeps:
-                env = build(loaded, config, substeps, infill, height)
+                loaded.config.env.physics.substeps = substeps
+                env = loaded.env(config.worlds, seed=config.seed, infill=infill, height_range=height)
                 line = measure(env, loaded, round(config.seconds / env.config.physics.control_dt))
                 print(f"{infill:.0%} / {height * 100:g} cm {substeps:11d} {line}", flush=True)
 
