@@ -24,7 +24,7 @@ PANELS = {
 }
 
 SMOOTHED = 25
-"""Updates that a point of the thick curves is the mean of."""
+"""Updates that a point of the thick curves is the mean of; fewer in a run of less than eight times as many."""
 
 
 @dataclass
@@ -35,6 +35,8 @@ class CurvesConfig:
     """Run directories."""
     out: str = "curves.png"
     """Picture to write; the numbers go into a CSV file beside it."""
+    chain: bool = False
+    """Draw the runs one after the other, as stages of one training (each with --init-from the one before)."""
 
 
 def read_scalars(run: str | Path) -> dict[str, list[tuple[int, float]]]:
@@ -56,12 +58,32 @@ def read_scalars(run: str | Path) -> dict[str, list[tuple[int, float]]]:
     return {name: sorted(points.items()) for name, points in merged.items()}
 
 
-def plot_curves(runs: list[Path], out: Path) -> Path:
-    """Draw the runs' curves into ``out`` (PNG) and write them beside it as CSV; returns the CSV's path."""
+def _chained(scalars: dict[str, dict[str, list[tuple[int, float]]]]) -> None:
+    """Let each run's samples begin where those of the run before end."""
+    begin = 0
+    for values in scalars.values():
+        for name, points in values.items():
+            values[name] = [(begin + step, value) for step, value in points]
+        begin = values["rollout/reward"][-1][0]
+
+
+def plot_curves(runs: list[Path], out: Path, *, chain: bool = False) -> Path:
+    """Draw the runs' curves into ``out`` (PNG) and write them beside it as CSV; returns the CSV's path.
+
+    Args:
+        runs: run directories.
+        out: the picture.
+        chain: whether each run begins where the one before ends.
+
+    Raises:
+        InputError: a run has no TensorBoard scalars.
+    """
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     scalars = {run.name: read_scalars(run) for run in runs}
+    if chain:
+        _chained(scalars)
     varied = [
         name for name in PANELS if any(np.ptp([y for _, y in run.get(name, [(0, 0)])]) for run in scalars.values())
     ]
@@ -71,13 +93,13 @@ def plot_curves(runs: list[Path], out: Path) -> Path:
     for axis, name in zip(axes[0], varied, strict=True):
         for number, (run, values) in enumerate(scalars.items()):
             steps, points = np.array(values.get(name, [])).reshape(-1, 2).T
-            smooth = uniform_filter1d(points, SMOOTHED, mode="nearest")
+            smooth = uniform_filter1d(points, min(SMOOTHED, len(points) // 8 + 1), mode="nearest")
             axis.plot(steps / 1e6, points, color=f"C{number}", linewidth=0.6, alpha=0.25)
             axis.plot(steps / 1e6, smooth, color=f"C{number}", linewidth=1.4, label=run)
         axis.set(title=PANELS[name], xlabel="samples [M]")
         axis.grid(alpha=0.3)
     if len(runs) > 1:
-        axes[0, 0].legend(frameon=False)
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
     figure.savefig(out, dpi=130)
     plt.close(figure)
     table = out.with_suffix(".csv")
@@ -99,7 +121,7 @@ def main() -> None:
         out = Path(config.out)
         if not out.absolute().parent.is_dir():
             raise InputError("--out", config.out, "its folder does not exist; create it or choose another")
-        table = plot_curves([Path(name) for name in config.runs], out)
+        table = plot_curves([Path(name) for name in config.runs], out, chain=config.chain)
         print(out.absolute(), table.absolute(), sep="\n")
 
     command_line(run)

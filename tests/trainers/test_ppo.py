@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -128,6 +129,12 @@ def test_curves_become_a_picture_and_a_table(run, tmp_path):
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
     rows = table.read_text().splitlines()
     assert rows[0].startswith("run,samples,rollout/reward") and len(rows) == 3
+
+
+def test_curves_of_stages_follow_one_another(run, tmp_path):
+    stage = shutil.copytree(run, tmp_path / "next")
+    rows = plot_curves([run, stage], tmp_path / "curves.png", chain=True).read_text().splitlines()
+    assert [row.split(",")[:2] for row in rows[1:]] == [["two", "80"], ["two", "160"], ["next", "240"], ["next", "320"]]
 
 
 def test_time_limit_ends_a_run_with_a_checkpoint(tmp_path):
