@@ -64,25 +64,25 @@ def main(config: HolesConfig) -> None:
     bounds = torch.tensor(list(CLASSES.values()))
     pairs, hits, falls, seconds = torch.zeros(4, len(CLASSES))
     td = env.reset()
-    steps, reward, waiting = round(config.seconds * 60), 0.0, 0.0
+    steps, rewards, waits = round(config.seconds * 60), torch.zeros(2), torch.zeros(2)
     for _ in range(steps):
         kind = torch.bucketize(distance_to_ground(env), bounds)
         td["action"] = mean_action(loaded.networks, td)
         td = env.step(td)["next"]
         hit, ended = td["events", "pair_hit"][:, 0], td["done"][:, 0]
-        reward += td["reward"].mean().item() / steps
-        waiting += (env.steps_since_hit > 60).float().mean().item() / steps
+        wait = (env.steps_since_hit > 60).long()
+        rewards += torch.bincount(wait, td["reward"][:, 0], minlength=2)
+        waits += torch.bincount(wait, minlength=2)
         seconds += torch.bincount(kind, minlength=len(CLASSES)) / 60
         pairs += torch.bincount(kind[hit | ended], minlength=len(CLASSES))
         hits += torch.bincount(kind[hit], minlength=len(CLASSES))
         falls += torch.bincount(kind[td["events", "tilt"][:, 0]], minlength=len(CLASSES))
         td = env.maybe_reset(td)
     total = config.worlds * config.seconds
-    print(
-        f"reward/step {reward:.3f}, pairs/s {hits.sum() / total:.3f}, falls/min {falls.sum() / total * 60:.2f}, ",
-        end="",
-    )
-    print(f"more than 1 s without a pair: {waiting:.1%} of the time")
+    rates = f"pairs/s {hits.sum() / total:.3f}, falls/min {falls.sum() / total * 60:.2f}"
+    print(f"reward/step {rewards.sum() / waits.sum():.3f}, {rates}")
+    share = f"{waits[1] / waits.sum():.1%} of the time, at {rewards[1] / waits[1]:.2f} reward/step"
+    print(f"more than 1 s without a pair: {share} (else {rewards[0] / waits[0]:.2f})")
     print("farther target     pairs    hit  fell  time per pair [s]  share of time")
     for k, name in enumerate(CLASSES):
         row = f"{pairs[k] / pairs.sum():9.1%} {hits[k] / pairs[k]:6.1%} {falls[k] / pairs[k]:5.1%}"
