@@ -119,8 +119,6 @@ class TrainConfig:
         if self.num_envs * self.ppo.horizon < self.ppo.minibatches:
             remedy = f"give at most --num-envs x --ppo.horizon ({self.num_envs * self.ppo.horizon})"
             raise InputError("--ppo.minibatches", self.ppo.minibatches, remedy)
-        if self.resume and self.init_from:
-            raise InputError("--init-from", self.init_from, "leave it out with --resume, which has its own networks")
         self.ppo.validate()
         self.network.validate()
 
@@ -175,7 +173,7 @@ def parse_command_line(default: TrainConfig | None = None, args: list[str] | Non
     """Read the command line over a preset's defaults, or over ``default``.
 
     Raises:
-        InputError: the preset or the task is unknown, or a resumed run is of another task.
+        InputError: the preset or the task is unknown, a resumed run is of another task, or is to begin with other networks.
     """
     args = sys.argv[1:] if args is None else args
     task = flag_value(args, "--task")
@@ -187,6 +185,9 @@ def parse_command_line(default: TrainConfig | None = None, args: list[str] | Non
         default = PRESETS[preset](task or "footstep")
     elif task is not None and task != default.task:
         raise InputError("--task", task, f"this run's task is {default.task!r}; leave the flag out with --resume")
+    init_from = flag_value(args, "--init-from")
+    if init_from is not None and flag_value(args, "--resume") is not None:
+        raise InputError("--init-from", init_from, "leave it out with --resume, which has its own networks")
     return tyro.cli(type(default), default=default, args=args, prog="python -m quadhrl.trainers.ppo")
 
 

@@ -58,7 +58,7 @@ class PPOTrainer:
         self.env = environment(config.env, config.num_envs, engine=config.engine, device=self.device, seed=config.seed)
         self.inherited = {"samples": 0, "wall_seconds": 0.0}
         """What had gone into the networks of ``--init-from``."""
-        if config.init_from:
+        if config.init_from and not config.resume:  # a resumed run keeps the name of what it once began with
             loaded = load_networks(config.init_from, task=config.task, field="--init-from")
             self.networks = loaded.networks.train()
             for name in self.inherited:

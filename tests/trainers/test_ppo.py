@@ -300,3 +300,8 @@ def test_history_counts_what_the_run_began_from(run, tmp_path):
     assert (first["total_samples"], then["samples"], then["total_samples"]) == (160, 80, 240)
     assert then["total_wall_seconds"] == pytest.approx(first["wall_seconds"] + then["wall_seconds"])
     assert then["machine"].endswith("cores")
+    resume = ["--resume", str(tmp_path / "next")]
+    command(*resume, "--total-steps", "160", check=0)
+    then = load_networks(tmp_path / "next").metadata
+    assert (then["samples"], then["total_samples"]) == (160, 320)
+    assert "leave it out with --resume" in command(*resume, "--init-from", str(run), check=2).stderr
