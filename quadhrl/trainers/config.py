@@ -87,7 +87,7 @@ class TrainConfig:
     total_steps: int = 20_000_000
     """Samples (control steps summed over worlds) to train for."""
     max_minutes: float = 0.0
-    """Stop, with a checkpoint, after this time even if total_steps is not reached [min]; 0 for no limit."""
+    """Stop, with a checkpoint, after this time even if total_steps is not reached [min]; 0 for no limit. Not kept by --resume."""
     seed: int = 0
     """Seed of networks, actions, targets and terrains."""
     log_dir: str = "logs"
@@ -188,6 +188,7 @@ def parse_command_line(default: TrainConfig | None = None, args: list[str] | Non
     init_from = flag_value(args, "--init-from")
     if init_from is not None and flag_value(args, "--resume") is not None:
         raise InputError("--init-from", init_from, "leave it out with --resume, which has its own networks")
+    default.max_minutes = 0.0  # of one start of a run, as in time slices: the next one has its own, or none
     return tyro.cli(type(default), default=default, args=args, prog="python -m quadhrl.trainers.ppo")
 
 

@@ -309,7 +309,7 @@ def train(config: TrainConfig) -> None:
                 save()
                 last_save = time.monotonic()
         save()
-    if stop.requested:
+    if trainer.samples < config.total_steps:
         print(f"stopped at {trainer.samples} samples; carry on with: --resume {directory.path}")
     else:
         print(f"done: {trainer.samples} samples in {trainer.wall_seconds:.0f} s, see {directory.path}")

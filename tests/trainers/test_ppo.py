@@ -19,6 +19,7 @@ from quadhrl.eval.curves import plot_curves, read_scalars
 from quadhrl.trainers.checkpoint import find_checkpoint, load_networks
 from quadhrl.trainers.config import parse_command_line, train_config_from_dict
 from quadhrl.trainers.ppo import PPOTrainer, train
+from quadhrl.trainers.run_directory import read_run_config
 
 TINY = ["--preset", "smoke", "--num-envs", "8", "--ppo.horizon", "10", "--ppo.epochs", "2", "--ppo.minibatches", "2"]
 
@@ -137,9 +138,12 @@ def test_curves_of_stages_follow_one_another(run, tmp_path):
     assert [row.split(",")[:2] for row in rows[1:]] == [["two", "80"], ["two", "160"], ["next", "240"], ["next", "320"]]
 
 
-def test_time_limit_ends_a_run_with_a_checkpoint(tmp_path):
+def test_time_limit_ends_one_start_of_a_run_with_a_checkpoint(tmp_path, capsys):
     train(tiny("--total-steps", "100000000", "--max-minutes", "0.02", "--log-dir", str(tmp_path), "--run-name", "r"))
     assert find_checkpoint(tmp_path / "r").is_file()
+    assert f"carry on with: --resume {tmp_path / 'r'}" in capsys.readouterr().out
+    carried_on = parse_command_line(read_run_config(str(tmp_path / "r")), ["--resume", str(tmp_path / "r")])
+    assert carried_on.max_minutes == 0 and carried_on.total_steps == 100_000_000
 
 
 def test_ctrl_c_saves_and_resume_carries_on(tmp_path):
