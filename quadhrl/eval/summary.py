@@ -13,7 +13,7 @@ from quadhrl.eval.methods import METHODS
 from quadhrl.eval.rollouts import Episode
 from quadhrl.eval.terrains import PUBLISHED, PUBLISHED_CLAIMS, TestTerrain
 
-__all__ = ["CLAIMS", "Interval", "Normalizer", "Summary", "bootstrap_mean", "published_json", "summarize"]
+__all__ = ["CLAIMS", "Evidence", "Interval", "Normalizer", "Summary", "bootstrap_mean", "published_json", "summarize"]
 
 
 class Interval(NamedTuple):
@@ -34,13 +34,31 @@ class Normalizer:
     """The largest reached in training: the paper's text."""
 
 
+class Claim(NamedTuple):
+    """That the hierarchical method is better in one metric, on so and so many terrains."""
+
+    text: str
+    metric: str
+    sign: float
+    """1 where more is better, -1 where less is."""
+    bar: float | None
+    """What is to be beaten; None for the end-to-end policy."""
+
+
 CLAIMS = {
-    "reward_h_over_f": "normalised reward: hierarchical above end-to-end",
-    "reward_over_100": "normalised reward: hierarchical above 100 %",
-    "distance_h_over_f": "distance: hierarchical above end-to-end",
-    "collisions_h_under_f": "collisions per step: hierarchical below end-to-end",
+    "reward_h_over_f": Claim("normalised reward: hierarchical above end-to-end", "normalized_reward", 1.0, None),
+    "reward_over_100": Claim("normalised reward: hierarchical above 100 %", "normalized_reward", 1.0, 100.0),
+    "distance_h_over_f": Claim("distance: hierarchical above end-to-end", "distance", 1.0, None),
+    "collisions_h_under_f": Claim("collisions per step: hierarchical below end-to-end", "collisions", -1.0, None),
 }
-"""The paper's claims, each a number of terrains on which it holds."""
+"""The paper's claims."""
+
+
+class Evidence(NamedTuple):
+    """Terrains on which the rollouts settle a claim: the 95 % interval of the mean difference leaves 0 out."""
+
+    supported: int
+    contradicted: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +68,9 @@ class Summary:
     cells: dict[str, dict[TestTerrain, dict[str, Interval]]]
     """By method, terrain and metric."""
     claims: dict[str, int]
-    """Terrains on which each claim holds; empty unless both compared methods are there."""
+    """Terrains on which each claim holds, by the means alone, as in the paper; empty unless both compared methods are there."""
+    evidence: dict[str, Evidence]
+    """Of each claim: how often chance hardly explains the difference. Rollouts on the same blocks are paired."""
     claims_of: int
     """Terrains that the claims are counted over: those with both methods."""
 
@@ -70,6 +90,7 @@ class Summary:
         return {
             "claims": self.claims,
             "claims_of": self.claims_of,
+            "claims_evidence": {name: evidence._asdict() for name, evidence in self.evidence.items()},
             "published_claims": PUBLISHED_CLAIMS,
             "cells": cells,
         }
@@ -91,6 +112,7 @@ def summarize(
         by_cell.setdefault((episode.method, TestTerrain(episode.infill, episode.height_range)), []).append(episode)
     metrics = _UNTIL_STUCK if until_stuck else _WHOLE
     cells: dict[str, dict[TestTerrain, dict[str, Interval]]] = {}
+    values: dict[tuple[str, TestTerrain], dict[int, dict[str, float]]] = {}  # by rollout
     for method, info in METHODS.items():
         for terrain in sorted({terrain for _, terrain in by_cell}, key=lambda t: (t.height_range, -t.infill)):
             runs = by_cell.get((method, terrain))
@@ -100,21 +122,32 @@ def summarize(
             unit = normalizer.training if by_training else normalizer.deterministic
             columns = {name: np.array([metric(run) for run in runs]) for name, metric in metrics.items()}
             columns = {"normalized_reward": 100.0 * columns["reward"] / unit} | columns
-            cell = {name: bootstrap_mean(values) for name, values in columns.items()}
+            cell = {name: bootstrap_mean(column) for name, column in columns.items()}
             cells.setdefault(method, {})[terrain] = cell
+            values[method, terrain] = {
+                run.rollout: {name: float(column[k]) for name, column in columns.items()} for k, run in enumerate(runs)
+            }
     ours, theirs = cells.get("hlp", {}), cells.get("end-to-end", {})
     shared = [terrain for terrain in ours if terrain in theirs]
+    claims: dict[str, int] = {}
+    evidence: dict[str, Evidence] = {}
+    for name, claim in CLAIMS.items() if shared else ():
+        advantages = [_advantage(claim, values["hlp", t], values["end-to-end", t]) for t in shared]
+        evidence[name] = Evidence(sum(a.low > 0.0 for a in advantages), sum(a.high < 0.0 for a in advantages))
+        metric, sign, bar = claim.metric, claim.sign, claim.bar
+        claims[name] = sum(
+            sign * (ours[t][metric].mean - (theirs[t][metric].mean if bar is None else bar)) > 0.0 for t in shared
+        )
+    return Summary(cells, claims, evidence, len(shared))
 
-    def count(name: str, better: Callable[[float, float], bool]) -> int:
-        return sum(better(ours[t][name].mean, theirs[t][name].mean) for t in shared)
 
-    claims = {
-        "reward_h_over_f": count("normalized_reward", lambda h, f: h > f),
-        "reward_over_100": sum(ours[t]["normalized_reward"].mean > 100.0 for t in shared),
-        "distance_h_over_f": count("distance", lambda h, f: h > f),
-        "collisions_h_under_f": count("collisions", lambda h, f: h < f),
-    }
-    return Summary(cells, claims if shared else {}, len(shared))
+def _advantage(claim: Claim, ours: dict[int, dict[str, float]], theirs: dict[int, dict[str, float]]) -> Interval:
+    """Mean advantage over the rollouts, each against the other method's on the same blocks, or against the claim's bar."""
+    numbers = sorted(ours.keys() & theirs.keys() if claim.bar is None else ours.keys())
+    if len(numbers) < 2:
+        return Interval(0.0, -np.inf, np.inf)  # one rollout settles nothing
+    other = [theirs[n][claim.metric] if claim.bar is None else claim.bar for n in numbers]
+    return bootstrap_mean(claim.sign * (np.array([ours[n][claim.metric] for n in numbers]) - other))
 
 
 def bootstrap_mean(values: np.ndarray) -> Interval:

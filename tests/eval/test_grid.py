@@ -145,12 +145,31 @@ def test_summary_and_claims_by_hand():
         "distance_h_over_f": 1,  # 5.25 < 6, 1.0 > 0.9
         "collisions_h_under_f": 1,  # 0.10 < 0.12, 0.3 > 0.2
     }
+    assert summary.evidence["reward_h_over_f"] == (0, 0), "a pair of rollouts at most"
     stuck = summarize(episodes, normalizers, until_stuck=True)
     assert stuck.cells["hlp"][b]["normalized_reward"].mean == pytest.approx(100 * 4.0 / 2.5)
     assert stuck.claims["reward_h_over_f"] == 2 and stuck.claims["collisions_h_under_f"] == 2
     training = summarize(episodes, normalizers, by_training=True)
     assert training.cells["hlp"][a]["normalized_reward"].mean == pytest.approx(100.0)
     assert training.claims["reward_over_100"] == 0
+
+
+def test_a_claim_is_settled_where_the_paired_difference_leaves_zero_out():
+    a, b, c = TestTerrain(1.0, 0.0), TestTerrain(0.8, 0.1), TestTerrain(0.9, 0.1)
+    episodes = []
+    for k in range(10):  # the blocks of rollout 9 are easy for both: the difference is the same on all
+        easy = 5.0 * (k == 9)
+        episodes += [
+            episode("hlp", a, 9 - k, distance=1.0 + 5.0 * (k == 0)),
+            episode("end-to-end", a, k, distance=0.9 + easy),
+        ]
+        episodes += [episode("hlp", b, k, distance=1.0), episode("end-to-end", b, k, distance=1.0 + 0.01 * k)]
+        episodes += [episode("hlp", c, k, distance=2.0 + k), episode("end-to-end", c, k, distance=2.1 + 9 - k)]
+    summary = summarize(episodes, {"footstep": Normalizer(1.0, 1.0), "forward": Normalizer(1.0, 1.0)})
+    assert summary.claims["distance_h_over_f"] == 1
+    assert summary.evidence["distance_h_over_f"] == (1, 1), "a for, b against, c scatters"
+    assert summary.evidence["reward_h_over_f"] == (0, 0), "no difference at all"
+    assert summary.to_json()["claims_evidence"]["distance_h_over_f"] == {"supported": 1, "contradicted": 1}
 
 
 def test_bootstrap_interval_covers_as_often_as_it_says():
