@@ -134,7 +134,7 @@ def run_grid(config: GridConfig) -> Path:
     }
     facts = _facts(config, folder, policies, normalizers)
     _write_summary(folder.path / "summary.json", summary, variants, facts | {"run": run})
-    write_table(folder.path, summary)
+    write_table(folder.path, summary, variants["authors_rules"])
     return write_report(folder.path, config, summary, variants, facts, run)
 
 

@@ -56,29 +56,39 @@ def write_report(
     return path
 
 
-def write_table(folder: Path, summary: Summary) -> Path:
-    """Write the means of every terrain as a Markdown table, ``table.md``, published figures in brackets; returns its path."""
-    columns = [
-        (method, metric, title)
-        for metric, title in (
-            ("normalized_reward", "reward %"),
-            ("distance", "distance m"),
-            ("collisions", "collisions/step"),
-        )
-        for method in ("hlp", "end-to-end", *(("llp-in-place",) if metric == "normalized_reward" else ()))
-        if method in summary.cells
-    ]
+def write_table(folder: Path, summary: Summary, until_stuck: Summary) -> Path:
+    """Write the means of every terrain as a Markdown table, ``table.md``, published figures in brackets; returns its path.
+
+    Args:
+        folder: where to.
+        summary: results of whole rollouts.
+        until_stuck: the same, each rollout up to the moment in which the robot was first stuck: what was published of `hlp`.
+    """
+    columns: list[tuple[str, str, str, Summary]] = []
+    for metric, title in (
+        ("normalized_reward", "reward %"),
+        ("distance", "distance m"),
+        ("collisions", "collisions/step"),
+    ):
+        columns += [
+            (f"{title}, hlp", metric, "hlp", summary),
+            (f"{title}, hlp until stuck", metric, "hlp", until_stuck),
+        ]
+        columns += [(f"{title}, end-to-end", metric, "end-to-end", summary)]
+        if metric == "normalized_reward":
+            columns += [(f"{title}, llp-in-place", metric, "llp-in-place", summary)]
+    columns = [column for column in columns if column[2] in summary.cells]
     lines = [
-        "| infill % / height m | " + " | ".join(f"{title}, {method}" for method, _, title in columns) + " |",
+        "| infill % / height m | " + " | ".join(title for title, *_ in columns) + " |",
         "| --- |" + " ---: |" * len(columns),
     ]
     for terrain in summary.terrains:
         cells = []
-        for method, metric, _ in columns:
-            cell = summary.cells[method].get(terrain)
+        for _, metric, method, source in columns:
+            cell = source.cells[method].get(terrain)
             digits = {"normalized_reward": 0, "distance": 1, "collisions": 2}[metric]
             text = "" if cell is None else f"{cell[metric].mean:.{digits}f}"
-            if terrain in PUBLISHED and method != "llp-in-place":
+            if terrain in PUBLISHED and (method == "end-to-end" or source is until_stuck):
                 published = getattr(PUBLISHED[terrain], CHARTS[metric][0])[("hlp", "end-to-end").index(method)]
                 text += f" ({published:.{digits}f})"
             cells.append(text)
