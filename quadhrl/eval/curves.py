@@ -94,8 +94,9 @@ def plot_curves(runs: list[Path], out: Path, *, chain: bool = False) -> Path:
         for number, (run, values) in enumerate(scalars.items()):
             steps, points = np.array(values.get(name, [])).reshape(-1, 2).T
             smooth = uniform_filter1d(points, min(SMOOTHED, len(points) // 8 + 1), mode="nearest")
-            axis.plot(steps / 1e6, points, color=f"C{number}", linewidth=0.6, alpha=0.25)
-            axis.plot(steps / 1e6, smooth, color=f"C{number}", linewidth=1.4, label=run)
+            color, dashes = f"C{number}", ("-", "--")[number // 10 % 2]  # there are ten colors
+            axis.plot(steps / 1e6, points, color=color, linewidth=0.6, alpha=0.25)
+            axis.plot(steps / 1e6, smooth, color=color, linestyle=dashes, linewidth=1.4, label=run)
         axis.set(title=PANELS[name], xlabel="samples [M]")
         axis.grid(alpha=0.3)
     if len(runs) > 1:
