@@ -144,8 +144,8 @@ def summarize(
 def _advantage(claim: Claim, ours: dict[int, dict[str, float]], theirs: dict[int, dict[str, float]]) -> Interval:
     """Mean advantage over the rollouts, each against the other method's on the same blocks, or against the claim's bar."""
     numbers = sorted(ours.keys() & theirs.keys() if claim.bar is None else ours.keys())
-    if len(numbers) < 2:
-        return Interval(0.0, -np.inf, np.inf)  # one rollout settles nothing
+    if len(numbers) < 5:  # of fewer, all differ in the same direction by chance too often for 95 %
+        return Interval(0.0, -np.inf, np.inf)
     other = [theirs[n][claim.metric] if claim.bar is None else claim.bar for n in numbers]
     return bootstrap_mean(claim.sign * (np.array([ours[n][claim.metric] for n in numbers]) - other))
 

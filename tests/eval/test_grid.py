@@ -145,7 +145,7 @@ def test_summary_and_claims_by_hand():
         "distance_h_over_f": 1,  # 5.25 < 6, 1.0 > 0.9
         "collisions_h_under_f": 1,  # 0.10 < 0.12, 0.3 > 0.2
     }
-    assert summary.evidence["reward_h_over_f"] == (0, 0), "a pair of rollouts at most"
+    assert summary.evidence["reward_h_over_f"] == (0, 0), "too few rollouts"
     stuck = summarize(episodes, normalizers, until_stuck=True)
     assert stuck.cells["hlp"][b]["normalized_reward"].mean == pytest.approx(100 * 4.0 / 2.5)
     assert stuck.claims["reward_h_over_f"] == 2 and stuck.claims["collisions_h_under_f"] == 2
@@ -169,6 +169,10 @@ def test_a_claim_is_settled_where_the_paired_difference_leaves_zero_out():
     assert summary.claims["distance_h_over_f"] == 1
     assert summary.evidence["distance_h_over_f"] == (1, 1), "a for, b against, c scatters"
     assert summary.evidence["reward_h_over_f"] == (0, 0), "no difference at all"
+    few = summarize(
+        [e for e in episodes if e.rollout < 4], {"footstep": Normalizer(1.0, 1.0), "forward": Normalizer(1.0, 1.0)}
+    )
+    assert few.evidence["distance_h_over_f"] == (0, 0), "four rollouts settle nothing"
     assert summary.to_json()["claims_evidence"]["distance_h_over_f"] == {"supported": 1, "contradicted": 1}
 
 
